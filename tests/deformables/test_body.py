@@ -46,7 +46,7 @@ def body(quadrature: Quadrature) -> ReducedBody:
     return build_body(quadrature, SMALL, name="capsule")
 
 
-@pytest.fixture(scope="module", params=["box", "sphere"])
+@pytest.fixture(scope="module", params=["box", pytest.param("sphere", marks=pytest.mark.rest)])
 def default(request) -> tuple[Quadrature, ReducedBody]:
     """Bodies built with the default options."""
     found = quadrature_from_box((0.06, 0.05, 0.04)) if request.param == "box" else quadrature_from_sphere(0.03)
@@ -141,6 +141,7 @@ def test_volume_counts_and_shapes(default) -> None:
     np.testing.assert_allclose(body.bounds + body.offset, quadrature.bounds, atol=1e-15)
 
 
+@pytest.mark.rest
 def test_symmetric_object_drops_repeated_functions() -> None:
     """On a sphere x W_y = y W_x: the rank check removes the repeats, on a box with three unequal edges nothing."""
     sphere = build_body(quadrature_from_sphere(0.03), BuildOptions(mode_count=8))
@@ -482,6 +483,7 @@ def test_a_field_of_the_span_is_projected_onto_itself(body: ReducedBody) -> None
     np.testing.assert_allclose(body.project(lambda X: body.evaluate(X)[0] @ q), q, atol=1e-11 * np.abs(q).max())
 
 
+@pytest.mark.rest
 def test_the_error_of_a_projected_field_falls_with_the_functions() -> None:
     """With 4, 8 and 16 modes the error of a smooth field falls, at most a tenth above the best there is."""
     quadrature = quadrature_from_box((0.4, 0.1, 0.1), point_count=2000, surface_count=60)

@@ -97,6 +97,7 @@ def test_elastic_modes_of_a_free_body(full) -> None:
     np.testing.assert_allclose(mode.T @ stiffness @ mode, np.eye(len(value)), atol=1e-9)
 
 
+@pytest.mark.rest
 def test_soft_modes_of_a_thin_held_plate() -> None:
     """A plate 40:1, held at one end: the lowest 12 eigenvalues of few points are those of all points to 5 %."""
     quadrature = quadrature_from_box((1.0, 0.6, 0.025), point_count=4000)
@@ -158,6 +159,7 @@ def test_deterministic_and_seeded(full) -> None:
     assert not np.array_equal(first.index, other.index)
 
 
+@pytest.mark.rest
 def test_the_best_trial_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where no trial meets the goal the body has the one that errs least, though a later one errs more."""
     errors = []

@@ -187,6 +187,7 @@ def test_where_the_body_is(bar: ReducedBody) -> None:
     np.testing.assert_array_equal(cut.owners(X), np.where(np.sign(level) == sides[0], 0, 1))
 
 
+@pytest.mark.rest
 def test_two_cuts_in_a_row(bar: ReducedBody, halves: tuple[ReducedBody, ...]) -> None:
     """A part is cut again, across and along; mass and momentum are still those of the bar."""
     cut = cut_body(halves[0], LENGTHWISE)
@@ -229,6 +230,7 @@ def test_a_slit_opens(bar: ReducedBody) -> None:
     assert len(across.bodies[0].hidden_pairs) and not any(len(part.hidden_pairs) for part in across.bodies[1:])
 
 
+@pytest.mark.rest
 def test_lips_have_handles_of_their_own(bar: ReducedBody, monkeypatch: pytest.MonkeyPatch) -> None:
     """The space of a slit that someone waits for is nearly as soft as one of 96 eigenmodes, by handles at the lips.
 
@@ -255,6 +257,7 @@ def test_lips_have_handles_of_their_own(bar: ReducedBody, monkeypatch: pytest.Mo
     assert (found / many).max() < 1.05 and (bare / many).max() > 1.1
 
 
+@pytest.mark.rest
 def test_prongs_that_touch_do_not_grow_together() -> None:
     """The prongs of a fork, bent until they overlap and cut both, are parts of their own, and so is the root."""
     mask = np.zeros((5, 2, 8), dtype=bool)
@@ -298,25 +301,33 @@ def test_crumbs_are_dropped(bar: ReducedBody) -> None:
     assert cut.owners(corner[None] - 1e-4)[0] == -1
 
 
-def test_regions_go_with_their_part(bar: ReducedBody) -> None:
-    """Exact ones are not cut through; soft ones are, and each half keeps its share."""
-    end = Region(name="end", box=((-1.0, -1.0, -1.0), (-0.08, 1.0, 1.0)))
+END = Region(name="end", box=((-1.0, -1.0, -1.0), (-0.08, 1.0, 1.0)))
+
+
+def test_an_exact_region_goes_with_its_part(bar: ReducedBody) -> None:
+    """It is not cut through, and the momentum of the held bar is that of the parts."""
+    held = hold(bar, END)
+    qd = motion(held)[1]
+    parts = cut_body(held, MIDDLE).bodies
+    assert [part.region_names for part in parts] == [("end",), ()]
+    after = sum(part.volume * part.mean_basis @ carry_over(held, part, 0.0 * qd, qd)[1] for part in parts)
+    before = held.volume * held.mean_basis @ qd
+    np.testing.assert_allclose(after, before, atol=1e-9 * np.linalg.norm(before))
+    with pytest.raises(ConfigError, match="cuts the exact region 'end'"):
+        cut_body(held, LENGTHWISE)
+
+
+@pytest.mark.rest
+def test_a_soft_region_is_cut_through(bar: ReducedBody) -> None:
+    """Each half keeps its share."""
     soft = Region(name="soft", box=((-0.03, -1.0, -1.0), (0.05, 1.0, 1.0)), stiffness=1e4)
-    held = hold(bar, end, soft)
+    held = hold(bar, END, soft)
     cut = cut_body(held, MIDDLE)
     assert [part.region_names for part in cut.bodies] == [("end", "soft"), ("soft",)]
     qd = motion(held)[1]
     after = sum(part.volume * part.mean_basis @ carry_over(held, part, 0.0 * qd, qd)[1] for part in cut.bodies)
     before = held.volume * held.mean_basis @ qd
     np.testing.assert_allclose(after, before, atol=5e-3 * np.linalg.norm(before))  # cells at the soft region differ
-    clamped = hold(bar, end)
-    qd = motion(clamped)[1]
-    parts = cut_body(clamped, MIDDLE).bodies
-    after = sum(part.volume * part.mean_basis @ carry_over(clamped, part, 0.0 * qd, qd)[1] for part in parts)
-    before = clamped.volume * clamped.mean_basis @ qd
-    np.testing.assert_allclose(after, before, atol=1e-9 * np.linalg.norm(before))
-    with pytest.raises(ConfigError, match="cuts the exact region 'end'"):
-        cut_body(held, LENGTHWISE)
     assert len(cut_body(held, Patch.plane((-0.05, 0.0, 0.0), (1.0, 0.0, 0.0))).bodies) == 2
 
 

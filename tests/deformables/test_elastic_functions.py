@@ -6,6 +6,7 @@ Builds bodies of functions chosen by elastic energy, which is what it tests.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import warnings
 
@@ -20,6 +21,7 @@ from softmode.deformables.build.build_body import build_body
 from softmode.deformables.build.elastic_functions import SPACE_ERROR, SPACE_MODE_COUNTS
 from softmode.deformables.build.options import FUNCTION_COUNT, BuildOptions
 from softmode.deformables.build.quadrature import quadrature_from_box, quadrature_from_mesh, quadrature_from_sphere
+from softmode.deformables.build.quadrature_grid import Quadrature
 from softmode.deformables.build.reduced_stiffness import reduced_stiffness
 from softmode.deformables.build.report import report_body
 from softmode.deformables.materials.material import Material
@@ -38,11 +40,15 @@ SOFT = Region(name="foot", box=((0.02, -1.0, -1.0), (1.0, 1.0, 0.0)), stiffness=
 OTHER = Region(name="other", box=((-1.0, -1.0, -1.0), (-0.03, 1.0, 0.0)), stiffness=1e3)
 
 
+@functools.cache
+def box() -> Quadrature:
+    """Return the points of a box."""
+    return quadrature_from_box(SIZE, point_count=1500, **FEW)
+
+
 def built(**options: object) -> ReducedBody:
     """Return a box with all of its points and few kernels."""
-    return build_body(
-        quadrature_from_box(SIZE, point_count=1500, **FEW), BuildOptions(**{**ALL, **options}), progress=False
-    )
+    return build_body(box(), BuildOptions(**{**ALL, **options}), progress=False)
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +86,7 @@ def test_affine_motion_is_exact(bodies: dict[int, ReducedBody]) -> None:
 
 def test_functions_are_orthonormal_in_mass() -> None:
     """Also with a density that varies, and only the first has a mean."""
-    quadrature = quadrature_from_box(SIZE, point_count=1500, **FEW)
+    quadrature = box()
     density = np.where(quadrature.points[:, 0] > 0.0, 3.0, 1.0)
     body = build_body(quadrature, BuildOptions(function_count=40, **ALL), density_scale=density, progress=False)
     value = body.evaluate(quadrature.points - body.offset)[0]
@@ -111,6 +117,7 @@ def test_accuracy_out_of_reach_is_refused() -> None:
         build_body(quadrature_from_sphere(0.05, point_count=3000, **FEW), BuildOptions(accuracy=1e-7), progress=False)
 
 
+@pytest.mark.rest
 def test_the_space_grows_where_it_must() -> None:
     """A bar keeps the smaller space, a thin tube takes the larger one, and says how far from settled it is."""
     wide = 10 * (min(SPACE_MODE_COUNTS) + 1)
@@ -171,10 +178,19 @@ def test_detached_parts_move_against_each_other() -> None:
 def held(count: int | None = None, regions: tuple[Region, ...] = (LEFT,), **options: object) -> ReducedBody:
     """Return the box held in regions, with all of its points and few kernels."""
     given = BuildOptions(**{**ALL, "kernel_count": 120, "function_count": count, **options})
-    return build_body(quadrature_from_box(SIZE, point_count=1500, **FEW), given, regions=regions, progress=False)
+    return build_body(box(), given, regions=regions, progress=False)
 
 
-@pytest.mark.parametrize("regions", [(LEFT,), (LEFT, RIGHT), (LEFT, SOFT), (SOFT,), (SOFT, OTHER)])
+@pytest.mark.parametrize(
+    "regions",
+    [
+        pytest.param((LEFT,), marks=pytest.mark.rest),
+        pytest.param((LEFT, RIGHT), marks=pytest.mark.rest),
+        (LEFT, SOFT),
+        pytest.param((SOFT,), marks=pytest.mark.rest),
+        (SOFT, OTHER),
+    ],
+)
 def test_functions_of_held_bodies_are_nested(regions: tuple[Region, ...]) -> None:
     """Functions that vanish on exact regions are the first of a larger count; all span what the larger ones span."""
     few, many = held(24, regions), held(40, regions)
@@ -202,6 +218,7 @@ def test_held_bodies_know_their_response() -> None:
     assert work[0] == pytest.approx(work[1], rel=2e-3)
 
 
+@pytest.mark.rest
 def test_accuracy_of_held_bodies() -> None:
     """Accuracy is that of the frequencies of the held body, and default bodies have 48 functions too."""
     rough, fine = held(accuracy=0.1), held(accuracy=0.01)
@@ -270,6 +287,7 @@ def test_ratios_without_a_material_are_refused(ratio: float | tuple[float, ...])
         BuildOptions(poissons_ratio=ratio)
 
 
+@pytest.mark.rest
 def test_more_functions_than_there_are() -> None:
     """What the elastic modes cannot make is told."""
     quadrature = quadrature_from_box((0.3, 0.03, 0.03), point_count=1500)

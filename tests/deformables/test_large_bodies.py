@@ -60,7 +60,7 @@ def direction_of(scene: Scene, *, tiled: bool, by_panels: bool) -> tuple[np.ndar
 
 
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("counts", [(64,), (76,), (136, 76)])
+@pytest.mark.parametrize("counts", [pytest.param((64,), marks=pytest.mark.rest), (76,), (136, 76)])
 def test_tiles_equal_blocks(counts: tuple[int, ...], device: str) -> None:
     """The same sums over the points, of bodies that end within a tile: to rounding of single precision."""
     scene = scene_of(*counts, device=device)
@@ -87,7 +87,7 @@ def test_points_in_chunks(device: str) -> None:
 
 
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("count", [8, 24, 56, 88, 136, 200])
+@pytest.mark.parametrize("count", [*(pytest.param(n, marks=pytest.mark.rest) for n in (8, 24, 56, 88, 136)), 200])
 def test_no_capacity_cliff(count: int, device: str) -> None:
     """Bodies from 24 to 600 unknowns bend alike, whichever launches their size calls for: 1e-5 of the size."""
     tips = []

@@ -6,6 +6,7 @@ Builds bodies of local handles, which is what it tests.
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from softmode.deformables import (
     quadrature_from_mesh,
 )
 from softmode.deformables.build.local_handles import place_kernels
+from softmode.deformables.build.quadrature_grid import Quadrature
 from softmode.errors import ConfigError
 from softmode.usd.handles import coordinates_from_handles, handles_from_coordinates
 from tests.oracle.solids import SOLIDS, stiffness
@@ -37,16 +39,22 @@ TIP = ((0.09, 0.02, 0.01), 0.04)
 OPTIONS = BuildOptions(handles="local", local_count=6, kernel_count=150, cubature_count=None)
 
 
+@functools.cache
+def box(point_count: int = 1500) -> Quadrature:
+    """Return the points of the bar, with few samples of its surface."""
+    return quadrature_from_box(SIZE, point_count=point_count, surface_count=200)
+
+
 @pytest.fixture(scope="module")
 def body() -> ReducedBody:
     """Return a bar of six local handles."""
-    return build_body(quadrature_from_box(SIZE, point_count=1500), OPTIONS, name="bar", progress=False)
+    return build_body(box(), OPTIONS, name="bar", progress=False)
 
 
 def test_weights_sum_to_one(body: ReducedBody) -> None:
     """Beside the constant handle: none is large or negative, all sum to one, and each of many vanishes somewhere."""
     options = dataclasses.replace(OPTIONS, local_count=24, function_count=24)
-    more = build_body(quadrature_from_box(SIZE, point_count=1500), options, progress=False)
+    more = build_body(box(), options, progress=False)
     for one, count in ((body, 6), (more, 24)):
         weight, gradient = one.skinning_weights(one.points)
         assert weight.shape[1] == count + 1 and one.mode_count == count
@@ -108,7 +116,7 @@ def test_regions_hold_exactly(body: ReducedBody) -> None:
 
 def test_added_kernels_move_more_at_their_place(body: ReducedBody) -> None:
     """A force at the place does more work with a narrow handle there, that of all others stays; also from a file."""
-    quadrature = quadrature_from_box(SIZE, point_count=1500)
+    quadrature = box()
     more = build_body(quadrature, dataclasses.replace(OPTIONS, add_kernels=[TIP]), progress=False)
     assert more.function_count > body.function_count
 
@@ -123,7 +131,7 @@ def test_added_kernels_move_more_at_their_place(body: ReducedBody) -> None:
 
 def test_functions_chosen_among_local_ones_are_nested(tmp_path) -> None:
     """A number of functions takes them by elastic energy; a file and a late clamp keep the handles."""
-    quadrature = quadrature_from_box(SIZE, point_count=1500)
+    quadrature = box()
     options = dataclasses.replace(OPTIONS, function_count=30, add_kernels=[TIP])
     few, many = (
         build_body(quadrature, dataclasses.replace(options, function_count=n), progress=False) for n in (24, 30)
@@ -139,7 +147,7 @@ def test_functions_chosen_among_local_ones_are_nested(tmp_path) -> None:
 
 def test_cut_parts_keep_their_added_kernels() -> None:
     """Either half has six local handles; the added one goes to the half that it lies in."""
-    quadrature = quadrature_from_box(SIZE, point_count=1500)
+    quadrature = box()
     whole = build_body(quadrature, dataclasses.replace(OPTIONS, add_kernels=[TIP]), progress=False)
     cut = cut_body(whole, Patch.plane((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)))
     assert sorted(part.mode_count for part in cut.bodies) == [6, 7]
@@ -175,7 +183,7 @@ def test_bad_options(options: dict, word: str) -> None:
     """Each is refused by name, by the options or by the build."""
     with pytest.raises(ConfigError, match=word):
         build_body(
-            quadrature_from_box(SIZE, point_count=800),
+            box(800),
             BuildOptions(**{"handles": "local", **options}),
             progress=False,
         )

@@ -342,11 +342,17 @@ def test_bad_implicit_functions_are_refused() -> None:
         quadrature_from_sphere(1.0, surface_count=3)
 
 
-@pytest.mark.parametrize("count", [1000, 4000])
+@pytest.mark.parametrize("count", [1000, pytest.param(4000, marks=pytest.mark.rest)])
 @pytest.mark.parametrize(
-    "options", [{}, {"hole": 0.05}, {"floaters": 200}, {"hole": 0.05, "floaters": 200}],
+    "options",
+    [
+        pytest.param({}, marks=pytest.mark.rest),
+        pytest.param({"hole": 0.05}, marks=pytest.mark.rest),
+        pytest.param({"floaters": 200}, marks=pytest.mark.rest),
+        {"hole": 0.05, "floaters": 200},
+    ],
     ids=["whole", "hole", "floaters", "both"],
-)  # fmt: skip
+)
 def test_splat_shell_has_the_volume_of_its_sphere(count: int, options: dict) -> None:
     """V = 4/3 pi r^3 to 3 %, surface at r to 3 % away from a hole of 5 % of the area, floaters removed."""
     shell = make_shell(count, **options)
@@ -401,7 +407,7 @@ def test_object_on_a_wide_floor_is_found() -> None:
     assert found.members is not None and found.members[:2000].all() and not found.members[2000:].any()
 
 
-@pytest.mark.parametrize("level", ["4_0", "6_0"])
+@pytest.mark.parametrize("level", [pytest.param("4_0", marks=pytest.mark.rest), "6_0"])
 def test_trained_splat(level: str) -> None:
     """Of PLAYBOT (a robot over a floor slab) the robot is filled; levels of detail agree to 10 % in volume."""
     path = Path(__file__).parents[2].parent / "shared" / "data" / "splats" / "playbot" / level
