@@ -41,14 +41,14 @@ OTHER = Region(name="other", box=((-1.0, -1.0, -1.0), (-0.03, 1.0, 0.0)), stiffn
 
 
 @functools.cache
-def box() -> Quadrature:
+def small_box() -> Quadrature:
     """Return the points of a box."""
     return quadrature_from_box(SIZE, point_count=1500, **FEW)
 
 
 def built(**options: object) -> ReducedBody:
     """Return a box with all of its points and few kernels."""
-    return build_body(box(), BuildOptions(**{**ALL, **options}), progress=False)
+    return build_body(small_box(), BuildOptions(**{**ALL, **options}), progress=False)
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +86,7 @@ def test_affine_motion_is_exact(bodies: dict[int, ReducedBody]) -> None:
 
 def test_functions_are_orthonormal_in_mass() -> None:
     """Also with a density that varies, and only the first has a mean."""
-    quadrature = box()
+    quadrature = small_box()
     density = np.where(quadrature.points[:, 0] > 0.0, 3.0, 1.0)
     body = build_body(quadrature, BuildOptions(function_count=40, **ALL), density_scale=density, progress=False)
     value = body.evaluate(quadrature.points - body.offset)[0]
@@ -178,7 +178,7 @@ def test_detached_parts_move_against_each_other() -> None:
 def held(count: int | None = None, regions: tuple[Region, ...] = (LEFT,), **options: object) -> ReducedBody:
     """Return the box held in regions, with all of its points and few kernels."""
     given = BuildOptions(**{**ALL, "kernel_count": 120, "function_count": count, **options})
-    return build_body(box(), given, regions=regions, progress=False)
+    return build_body(small_box(), given, regions=regions, progress=False)
 
 
 @pytest.mark.parametrize(
