@@ -29,6 +29,7 @@ from softmode.envs.tasks.shape_soft import config as shape_soft
 from softmode.errors import BasisError
 from softmode.objects import ObjectConfig, load, task_objects
 from softmode.objects.source import object_source
+from tests.marks import rest_but
 
 GOOD = {
     "plush": ObjectConfig(),
@@ -74,9 +75,7 @@ def test_many_functions_are_noted(quadrature: Quadrature, body: ReducedBody) -> 
     assert "many functions" not in names(report_body(body, quadrature=quadrature))
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[] if name in ("plush", "cube") else pytest.mark.rest) for name in GOOD]
-)
+@pytest.mark.parametrize("name", rest_but(["plush", "cube"], GOOD))
 def test_good_bodies_are_clean(name: str) -> None:
     """Nothing is found on the plush and on every preset by their files, nor on some with what they were built from."""
     config = GOOD[name]

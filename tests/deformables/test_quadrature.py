@@ -22,6 +22,7 @@ from softmode.deformables.build.quadrature_grid import Quadrature
 from softmode.deformables.build.quadrature_implicit import quadrature_from_implicit
 from softmode.deformables.build.quadrature_mesh import quadrature_from_mesh
 from softmode.errors import AssetError, ConfigError
+from tests.marks import rest_but
 from tests.oracle.solids import SOLIDS
 from tests.shapes import SHAPES
 
@@ -342,15 +343,13 @@ def test_bad_implicit_functions_are_refused() -> None:
         quadrature_from_sphere(1.0, surface_count=3)
 
 
-@pytest.mark.parametrize("count", [1000, pytest.param(4000, marks=pytest.mark.rest)])
+BOTH = {"hole": 0.05, "floaters": 200}
+
+
+@pytest.mark.parametrize("count", rest_but([1000], [1000, 4000]))
 @pytest.mark.parametrize(
     "options",
-    [
-        pytest.param({}, marks=pytest.mark.rest),
-        pytest.param({"hole": 0.05}, marks=pytest.mark.rest),
-        pytest.param({"floaters": 200}, marks=pytest.mark.rest),
-        {"hole": 0.05, "floaters": 200},
-    ],
+    rest_but([BOTH], [{}, {"hole": 0.05}, {"floaters": 200}, BOTH]),
     ids=["whole", "hole", "floaters", "both"],
 )
 def test_splat_shell_has_the_volume_of_its_sphere(count: int, options: dict) -> None:
@@ -407,7 +406,7 @@ def test_object_on_a_wide_floor_is_found() -> None:
     assert found.members is not None and found.members[:2000].all() and not found.members[2000:].any()
 
 
-@pytest.mark.parametrize("level", [pytest.param("4_0", marks=pytest.mark.rest), "6_0"])
+@pytest.mark.parametrize("level", rest_but(["6_0"], ["4_0", "6_0"]))
 def test_trained_splat(level: str) -> None:
     """Of PLAYBOT (a robot over a floor slab) the robot is filled; levels of detail agree to 10 % in volume."""
     path = Path(__file__).parents[2].parent / "shared" / "data" / "splats" / "playbot" / level

@@ -185,6 +185,7 @@ def test_up_axis_turns_the_file_upright(tmp_path: Path) -> None:
     np.testing.assert_allclose(a.means, b.means, atol=1e-6)
 
 
+@pytest.mark.rest
 def test_trained_capture_becomes_the_robot(playbot: Path) -> None:
     """Ground and hands go; the pointed foot cannot carry it, so it lies; nothing of it is under the table."""
     config = ObjectConfig(splat=playbot, size=0.08)

@@ -20,13 +20,13 @@ from softmode.objects.paint import brushed
 from softmode.splats.point_cloud import splats_from_points
 
 SIZE = (0.1, 0.03, 0.03)
-OPTIONS = BuildOptions(function_count=24, cubature_count=128, kernel_count=150)
+OPTIONS = BuildOptions(function_count=24, cubature_count=48, kernel_count=100)
 RED, BLUE = (0.8, 0.1, 0.1), (0.1, 0.1, 0.8)
 
 
 def test_painted_late_is_painted_at_once() -> None:
     """Bit for bit the body that a build with the field gives, and softer; the density goes likewise."""
-    quadrature = quadrature_from_box(SIZE, point_count=1000, surface_count=100)
+    quadrature = quadrature_from_box(SIZE, point_count=500, surface_count=60)
     free = build_body(quadrature, OPTIONS, name="bar", progress=False)
     field = np.where(quadrature.points[:, 0] > 0.0, 0.1, 1.0)
     told = build_body(quadrature, OPTIONS, name="bar", stiffness_scale=field, progress=False)

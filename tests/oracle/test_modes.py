@@ -16,6 +16,7 @@ from softmode.deformables.build.build_body import build_body
 from softmode.deformables.build.hold import hold
 from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.build.quadrature import quadrature_from_box, quadrature_from_mesh
+from tests.marks import rest_but
 from tests.oracle.bend import BAR, bent_body, bent_solid
 from tests.oracle.fem import Mesh, free_eigenvalues
 from tests.oracle.solids import SOLIDS, TUBES, eigenvalues, frequency_errors
@@ -47,11 +48,7 @@ def test_finite_elements_of_a_beam() -> None:
 
 @pytest.mark.parametrize(
     ("name", "poissons_ratio"),
-    [
-        ("bar 10:1", 0.49),
-        pytest.param("fork", 0.3, marks=pytest.mark.rest),
-        pytest.param("round tube", 0.3, marks=pytest.mark.rest),
-    ],
+    rest_but([("bar 10:1", 0.49)], [("bar 10:1", 0.49), ("fork", 0.3), ("round tube", 0.3)]),
 )
 def test_default_frequencies(name: str, poissons_ratio: float) -> None:
     """The first six frequencies of the default body are those of finite elements."""
@@ -77,7 +74,7 @@ def test_eighty_functions(name: str, poissons_ratio: float) -> None:
     assert -0.01 < low and high < 0.02
 
 
-@pytest.mark.parametrize("name", [pytest.param(k, marks=[] if k == "bar, along" else pytest.mark.rest) for k in CASES])
+@pytest.mark.parametrize("name", rest_but(["bar, along"], CASES))
 def test_two_moduli(name: str) -> None:
     """A jump of ten times, in no relation to the grid, costs 6 % at most in the first six frequencies."""
     size, axis, jump = CASES[name]
