@@ -15,6 +15,7 @@ from softmode.errors import AssetError, ConfigError
 from softmode.mpm import MassLoss, MorphOptions, MorphPlanner, MorphRun, MpmOptions, morph, replay
 from softmode.mpm.run import ARRAYS
 from softmode.objects.solids import filled, solid_of
+from tests.marks import rest_but
 from tests.mpm.scenes import ball, torus
 
 
@@ -50,6 +51,7 @@ def test_stops_at_the_accuracy_asked_for() -> None:
     assert found[1:-7].all() and not found[-7:].any()
 
 
+@pytest.mark.rest
 def test_a_letter_becomes_another() -> None:
     """With an eighth of the particles A becomes 8 by 95 % of the loss, and is left long before the last frame."""
     bodies = filled([solid_of("A"), solid_of("8")], spacing=1.0)[1]
@@ -185,7 +187,7 @@ def test_several_targets_in_a_row() -> None:
     assert np.array_equal(alone.deformation, run.deformation[:3])
 
 
-@pytest.mark.parametrize("segments", [1, 3])
+@pytest.mark.parametrize("segments", rest_but([3], [1, 3]))
 def test_a_run_that_was_cut_off_is_gone_on_with(segments: int, tmp_path: Path) -> None:
     """Killed in its first or second target and started again, a run has the bits of one that was not."""
     file = tmp_path / "run.npz"
