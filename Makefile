@@ -89,11 +89,11 @@ test-rest: $(VENV)/.dev  ## run what `make test` leaves out: deeper repetitions,
 test-slow: $(VENV)/.dev  ## run all tests, slow ones included
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(FILES) -m 'slow or not slow' $(ARGS)
 
-lint: $(VENV)/.dev  ## ruff, pyright, and words that may not come back
+lint: $(VENV)/.dev  ## ruff, pyright, words that may not come back, names of what is not there
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --threads $(WORKERS)
-	$(BIN)/python -m pytest tests/test_words.py
+	$(BIN)/python -m pytest tests/test_words.py tests/test_names.py
 
 dist: $(VENV)/.dev  ## build sdist and wheel
 	rm -rf dist

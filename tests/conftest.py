@@ -77,6 +77,7 @@ _FAST = {
     "test_faces.py": "",
     "test_import.py": "",
     "test_layers.py": "",
+    "test_names.py": "",
     "test_words.py": "",
     "usd/test_export_bundle.py": "",
     "usd/test_import_newton.py": "units_of_everything",

@@ -93,9 +93,7 @@ class UsdDeformable:
         for name in Material.__dataclass_fields__:
             value = (self.bundle or {}).get(tokens.MATERIAL_PREFIX + name)
             if name == "model" and value is not None:
-                if value not in MaterialModel.__members__:
-                    raise MaterialError(f"{self.path}: unknown material model {value!r}", hint="Export the body again")
-                found[name] = MaterialModel[value]
+                found[name] = MaterialModel.__members__.get(str(value), str(value))
             elif isinstance(value, int | float):
                 found[name] = float(value)
         return found

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,6 @@ from softmode.scenes.replay_kernels import Operation, replay
 
 quieten_warp()
 
-_HOOKS = ("wp_cpu_launch_kernel", "wp_memcpy_h2h", "wp_memset_host", "wp_memtile_host")
 _ALIGNMENT = 64
 
 
@@ -42,7 +41,7 @@ class Recording:
         """Record the launches; they do not run."""
         own = wp.get_device(device)
         tape = _Tape(own)
-        with tape.listening() if own.is_cpu else _nothing(), wp.ScopedCapture(device=own) as capture:
+        with tape.listening() if own.is_cpu else nullcontext(), wp.ScopedCapture(device=own) as capture:
             launches()
         assert capture.graph is not None
         self.graph: wp.Graph = capture.graph
@@ -83,14 +82,6 @@ class _Tape:
         """Note what is recorded meanwhile."""
         core = getattr(getattr(wp, "_src", None), "context", None)
         core = getattr(getattr(core, "runtime", None), "core", None)
-        functions = {name: getattr(core, name, None) for name in _HOOKS}
-        methods = {name: getattr(self._device, name, None) for name in ("memset", "memtile")}
-        if not all(callable(function) for function in (*functions.values(), *methods.values())):
-            self._whole = False
-            yield
-            return
-        branches = {name: getattr(wp, name) for name in ("capture_if", "capture_while")}
-        places = [(core, functions), (self._device, methods), (wp, branches)]
         notes = {
             "wp_cpu_launch_kernel": self._note_launch,
             "wp_memcpy_h2h": self._note_copy,
@@ -99,6 +90,14 @@ class _Tape:
             "memset": self._note_fill,
             "memtile": self._note_repeat,
         }
+        functions = {name: getattr(core, name, None) for name in notes if name.startswith("wp_")}
+        methods = {name: getattr(self._device, name, None) for name in ("memset", "memtile")}
+        if not all(callable(function) for function in (*functions.values(), *methods.values())):
+            self._whole = False
+            yield
+            return
+        branches = {name: getattr(wp, name) for name in ("capture_if", "capture_while")}
+        places = [(core, functions), (self._device, methods), (wp, branches)]
         for place, known in places:
             for name, function in known.items():
                 noting = self._branching(function) if place is wp else self._noting(function, notes[name])
@@ -219,8 +218,3 @@ class _Tape:
 def _number(given: Any) -> int:
     """Return an integer that may come as one of ctypes."""
     return int(getattr(given, "value", given) or 0)
-
-
-@contextmanager
-def _nothing() -> Iterator[None]:
-    yield

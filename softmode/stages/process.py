@@ -90,7 +90,7 @@ def make_request(
     """Return a request as the process takes it; readers add what they need.
 
     Args:
-        what: Name of the reader: a module of `usd.child`.
+        what: Name of the reader: a module of `softmode.stages.child`.
         path: The file.
         answer: Where the answer goes.
         asset_root: Folder that holds whatever the stage may read; None for the file's own.

@@ -1,11 +1,13 @@
 """Materials: identities at rest, derivatives by finite differences, objectivity, projection, precision, errors."""
 
-from typing import NamedTuple
+from enum import IntEnum
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 import warp as wp
 
+from softmode.deformables.materials import paths
 from softmode.deformables.materials.hessian_kernels import HessianBlocks
 from softmode.deformables.materials.material import Material
 from softmode.deformables.materials.material_cpu_kernels import LANES
@@ -441,3 +443,24 @@ def test_parameters_out_of_range(name, value):
     """E > 0, -1 < nu < 0.5, rho > 0, the rest >= 0: anything else raises an error that names the parameter."""
     with pytest.raises(MaterialError, match=name):
         Material(**{name: value})
+
+
+@pytest.mark.parametrize("path", paths.PATHS)
+def test_a_model_that_a_path_lacks_does_not_start(path, monkeypatch):
+    """A member that all code but one part compares with is refused, and the error names that part alone."""
+    name = f"MADE_UP_{list(paths.PATHS).index(path)}"
+    models: Any = IntEnum("MaterialModel", {**MaterialModel.__members__, name: len(MaterialModel)})
+    monkeypatch.setattr(paths, "MaterialModel", models)
+    for other, code in paths.PATHS.items():
+        if other != path:
+            monkeypatch.setitem(paths.PATHS, other, (*code, f"if (model == {name})"))
+    with pytest.raises(MaterialError) as refused:
+        Material(model=models[name])
+    assert refused.value.message.endswith(f"is not known to {path}")
+
+
+@pytest.mark.parametrize("model", [-1, len(MaterialModel), "ARAP"])
+def test_what_is_no_model_is_refused(model):
+    """A number or a name that no code knows: all of it is named."""
+    with pytest.raises(MaterialError, match=", ".join(paths.PATHS)):
+        Material(model=model)

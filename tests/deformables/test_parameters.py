@@ -9,7 +9,7 @@ from softmode.deformables.materials.material import Material
 from softmode.deformables.model import status as bits
 from softmode.deformables.model.authoring import MATERIAL_FIELDS, add_pins, add_reduced_body
 from softmode.deformables.solver.parameters import PARAMETER_FLAGS, PARAMETER_LIMITS, ShapeFriction, set_parameters
-from softmode.errors import ConfigError
+from softmode.errors import ConfigError, MaterialError
 from tests.bodies import clamped, cube
 from tests.scenes import GRAVITY, Scene, add_gripper, rotation
 
@@ -114,6 +114,16 @@ def test_whatever_else_is_written_is_flagged_by_name(name, bad):
     scene.step()
     first, second = (bits.status_reasons(int(status)) for status in scene.reduced.status.numpy())
     assert not first and {"parameter_range", f"{name}_range"} <= set(second)
+
+
+def test_a_solver_refuses_models_that_are_not_known():
+    """A number written into the model before the solver is made, and one written later and told."""
+    with pytest.raises(MaterialError, match="material model 6"):
+        falling(finish=lambda model: model.softmode.material_model.fill_(6))
+    scene = falling()
+    scene.model.softmode.material_model.fill_(6)
+    with pytest.raises(MaterialError, match="material model 6"):
+        scene.solver.notify_model_changed(0)
 
 
 def test_a_driven_target_that_is_no_number_is_flagged():

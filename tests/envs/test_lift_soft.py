@@ -301,6 +301,24 @@ def test_results_are_never_reused(make_env: MakeEnv) -> None:
         np.testing.assert_array_equal(array, copy)
 
 
+def test_a_captured_step_is_replayed_without_warp(lift: LiftSoftEnv, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a CPU the graph that a step replays holds known operations, and Warp's slower replay takes no part.
+
+    A graph with an operation that softmode does not know is left to Warp in silence: a quarter more per control step.
+    """
+    if not lift.task.device.is_cpu:
+        pytest.skip("Warp replays graphs on CUDA")
+    launched = []
+    monkeypatch.setattr(wp, "capture_launch", launched.append)
+    graph = lift.task.graph
+    replay = graph.launch
+    monkeypatch.setattr(graph, "launch", lambda: replay() or launched.append("own"))
+    before = lift.reset(seed=0)[0]
+    after = lift.step(actions(lift, 1)[0])[0]
+    assert graph.operation_count > 0
+    assert launched == ["own"] and not np.array_equal(before, after)
+
+
 def test_reward_is_the_sum_of_its_terms(lift: LiftSoftEnv) -> None:
     """The reward equals the sum of info["reward_terms"]; far from the goal only `reach` pays."""
     for _, reward, _, _, info in rollout(lift, 10, seed=0)[1:]:

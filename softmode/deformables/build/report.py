@@ -1,7 +1,7 @@
 """What is good and bad about a body: measures, and findings each with a remedy. Arrays only, no pictures.
 
 Nothing is taken on trust from the build: mass, stiffness, coverage and Jacobians are measured anew over the interior
-(`body_interior`), with the functions that the body evaluates.
+(`softmode.deformables.build.interior`), with the functions that the body evaluates.
 """
 
 from __future__ import annotations

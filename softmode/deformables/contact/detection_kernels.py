@@ -1,7 +1,7 @@
 """Detection of contact between surface samples and the rigid shapes of the Newton model, once per step.
 
 Every sample is tested against the shapes near its body; gap, normal and lever arm are frozen for the step and become
-*point constraints* of the step (see ``contact`` for their energy): first the pins of the instance, then
+*point constraints* of the step (see ``penalty_kernels`` for their energy): first the pins of the instance, then
 its contacts in sample order.
 
 The queries are ours because Newton's public ``sdf_*`` functions come without their gradients, and because its soft
@@ -470,7 +470,7 @@ def gather_contacts(
     team: int,
     dt: float,
     # State in:
-    stick_shape: wp.array[wp.vec2i],  # (particle_count,), see ``stick_kernels``
+    stick_shape: wp.array[wp.vec2i],  # (particle_count,), see ``friction_memory_kernels``
     stick_point: wp.array[mat23d],
     # Out:
     constraints: PointConstraints,

@@ -468,7 +468,7 @@ def write_pairs(
     relative_stiffness: wp.array[float],  # (sample_total,), Young's modulus relative to the body's
     dent_length: wp.array[float],  # (sample_total,), see ``dents`` [m]
     stick_ratio: wp.float64,
-    stick_partner: wp.array[wp.vec2i],  # (particle_count,), see ``stick_kernels``
+    stick_partner: wp.array[wp.vec2i],  # (particle_count,), see ``friction_memory_kernels``
     stick_slip: wp.array[mat23d],  # (particle_count,) [m]
     dt: float,
     # In and out:

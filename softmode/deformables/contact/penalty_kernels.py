@@ -6,7 +6,7 @@ With the displacement d of the sample relative to the shape during the step, a c
 
 psi_n the C2 penalty p^3/(6 eps) for p < eps, p^2/2 - eps p/2 + eps^2/6 beyond (p the penetration), in series with the
 dent that the functions of the body cannot carry, and a stiffer one where p is large (see ``normal_potential``); s the
-slip that the contact remembers (see ``stick_kernels``); psi_t the
+slip that the contact remembers (see ``friction_memory_kernels``); psi_t the
 incremental potential of elastic-plastic friction, a spring k_t up to the force mu f_n and that force beyond (Cundall
 and Strack 1979, doi:10.1680/geot.1979.29.1.47), with the normal force f_n of the last Newton iterate. k_t does not
 depend on f_n: the energy of the spring cannot grow but by work, whatever the normal force does, so friction takes

@@ -8,7 +8,7 @@ integrator shows to an external force (joint damping D and drive damping K_d are
 2. mass matrix and body Jacobians at the start of the step;
 3. one Newton solve over [q of all bodies in the world ; r = dt * joint velocity] with
    1/(2 dt^2) (r - dt v*)^T M_eff (r - dt v*), MuJoCo's constraint rows (rigid contacts, joint limits, equalities,
-   friction loss; see ``constraint_kernels``) and the contact energies of both;
+   friction loss; see ``rigid_row_kernels``) and the contact energies of both;
 4. the reaction wrenches join ``state.body_f``;
 5. SolverMuJoCo steps again, from the same start.
 

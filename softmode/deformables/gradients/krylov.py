@@ -59,11 +59,6 @@ class Gmres:
         """|b - A x| / |b| of the last solution, per instance."""
         return self._krylov.error
 
-    @property
-    def product_count(self) -> wp.array:
-        """Products with A that the last solution took, per instance."""
-        return self._krylov.count
-
     def solve(self, apply: Apply, right: wp.array, solution: wp.array, *, tolerance: float) -> None:
         """Solve until |b - A x| <= tolerance |b| or the restarts are used up.
 

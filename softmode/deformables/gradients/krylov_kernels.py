@@ -24,7 +24,6 @@ class Krylov:
     world_running: wp.array[int]  # (world_count,)
     any_running: wp.array[int]  # (1,)
     column: wp.array[int]
-    count: wp.array[int]  # products with H so far
     target: wp.array[wp.float64]  # residual at which to stop
     error: wp.array[wp.float64]  # |b - H^T x| / |b|
     basis: wp.array3d[vec8d]  # (cycle_length + 1, instance_count, 3 block_count)
@@ -102,7 +101,6 @@ def begin_cycle(
     rho = wp.sqrt(team_sum(rho))
     if first_cycle != 0 and lane == 0:
         k.target[i] = tolerance * rho
-        k.count[i] = 0
     barrier()
     on = int(0)
     if rho > k.target[i]:
@@ -172,7 +170,6 @@ def extend_cycle(
         k.triangle[i, j, j] = radius
         k.tail[i, j + 1] = -turn[1] * k.tail[i, j]
         k.tail[i, j] = turn[0] * k.tail[i, j]
-        k.count[i] = k.count[i] + 1
     barrier()
     if wp.abs(k.tail[i, j + 1]) > k.target[i] and j + 1 < cycle_length and size > wp.float64(0.0):
         for e in range(lane, total, team):

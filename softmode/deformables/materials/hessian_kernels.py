@@ -53,16 +53,15 @@ def principal_hessian(material: MaterialParameters, G: wp.mat33d, sigma: wp.vec3
     y = sigma[1]
     z = sigma[2]
     strain = strain_measure(G)
+    minors = wp.vec3d(y * z, z * x, x * y)
     if material.model == int(MaterialModel.STVK):
         mean = wp.float64(0.5) * material.lam * strain
         squares = wp.vec3d(y * y + z * z - one, z * z + x * x - one, x * x + y * y - one)
-        products = wp.vec3d(y * z, z * x, x * y)
         S = material.lam * wp.outer(sigma, sigma) + mean * I
         S += material.mu * (wp.float64(3.0) * wp.diag(wp.cw_mul(sigma, sigma)) - I)
         shared = wp.vec3d(mean, mean, mean)
-        return material.mu * (squares - products) + shared, material.mu * (squares + products) + shared, S
+        return material.mu * (squares - minors) + shared, material.mu * (squares + minors) + shared, S
     _rest, s, b, p, l = invariant_derivatives(material, strain, determinant_minus_one(G))
-    minors = wp.vec3d(y * z, z * x, x * y)
     S = s * I + b * wp.outer(sigma, sigma) + l * wp.outer(minors, minors)
     S += p * wp.mat33d(zero, z, y, z, zero, x, y, x, zero)
     uniform = wp.vec3d(s, s, s)
@@ -108,11 +107,8 @@ def hessian(material: MaterialParameters, G: wp.mat33d, G_start: wp.mat33d, dt: 
         S = positive_part(S)
         twist = wp.max(twist, wp.vec3d())
         flip = wp.max(flip, wp.vec3d())
-    even = wp.vec3d()
-    odd = wp.vec3d()
-    for k in range(3):
-        even[k] = half * (flip[k] + twist[k])
-        odd[k] = half * (flip[k] - twist[k])
+    even = half * (flip + twist)
+    odd = half * (flip - twist)
     direct = wp.mat33d(zero, even[2], even[1], even[2], zero, even[0], even[1], even[0], zero)
     exchange = wp.mat33d(zero, odd[2], odd[1], odd[2], zero, odd[0], odd[1], odd[0], zero)
     if material.viscosity > zero:

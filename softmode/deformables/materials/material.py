@@ -43,6 +43,7 @@ from dataclasses import dataclass
 
 from softmode.checks import require_fields, require_number
 from softmode.deformables.materials.material_kernels import MaterialModel
+from softmode.deformables.materials.paths import require_models
 from softmode.errors import MaterialError
 
 
@@ -51,7 +52,7 @@ class Material:
     """Elastic and dissipative properties of one body.
 
     Raises:
-        MaterialError: If a value lies outside its admissible range.
+        MaterialError: If a value lies outside its admissible range, or code that evaluates it does not know the model.
     """
 
     youngs_modulus: float = 1.0e5
@@ -72,9 +73,9 @@ class Material:
 
     def __post_init__(self) -> None:
         """Check every range."""
-        error = MaterialError
-        require_fields(self, ("youngs_modulus", "density"), above=0.0, hint="give it in SI units", error=error)
+        require_fields(self, ("youngs_modulus", "density"), above=0.0, hint="give it in SI units", error=MaterialError)
         hint = "use 0.49 for a nearly incompressible material"
-        require_number("poissons_ratio", self.poissons_ratio, above=-1.0, below=0.5, hint=hint, error=error)
+        require_number("poissons_ratio", self.poissons_ratio, above=-1.0, below=0.5, hint=hint, error=MaterialError)
         rates = ("viscosity", "mass_damping", "friction")
-        require_fields(self, rates, at_least=0.0, hint="use 0 to switch it off", error=error)
+        require_fields(self, rates, at_least=0.0, hint="use 0 to switch it off", error=MaterialError)
+        require_models([self.model])

@@ -130,7 +130,7 @@ _LOGARITHM = """
         }
 """
 
-_SINGULAR_VALUES = """
+SINGULAR_VALUES = """
         static words orthogonal_pair(lanes* x, lanes* y, words moving) {
             FUSED
             lanes alpha = dot(x, x), beta = dot(y, y), gamma = dot(x, y), longer = most(alpha, beta);
@@ -198,10 +198,10 @@ _SINGULAR_VALUES = """
             sigma[1] = dot(w, y);
             sigma[2] = dot(n, z);
         }
+        static bool has_rotation(int model) { return model == ARAP || model == COROTATED; }
 """
 
-_ENERGY = """
-        static bool has_rotation(int model) { return model == ARAP || model == COROTATED; }
+ENERGY = """
         static lanes invariant_energy(int model, lanes mu, lanes lam, const lanes* E, lanes j1) {
             FUSED
             lanes volume = 0.5 * j1 * j1;
@@ -219,6 +219,9 @@ _ENERGY = """
             }
             return (lanes)0.0;
         }
+"""
+
+DERIVATIVES = """
         struct Derivatives { lanes rest, s, b, p, l; };
         static Derivatives invariant_derivatives(int model, lanes mu, lanes lam, lanes strain, lanes j1) {
             FUSED
@@ -265,7 +268,7 @@ _ENERGY = """
         }
 """
 
-_HESSIAN = """
+HESSIAN = """
         static void positive_part(lanes* S) {
             FUSED
             words sound = (S[0] > 0.0) & (S[0] * S[4] - S[1] * S[3] > 0.0) & (determinant(S) > 0.0);
@@ -367,8 +370,7 @@ _HESSIAN = """
             cofactor(F, cof);
             transpose(F, T);
             product(F, T, B);
-            lanes strain = 2.0 * trace(G) + ddot(G, G);
-            lanes j1 = trace(G) + second_invariant(G) + determinant(G);
+            lanes strain = 2.0 * trace(G) + ddot(G, G), j1 = trace(G) + second_invariant(G) + determinant(G);
             Derivatives t = invariant_derivatives(model, mu, lam, strain, j1);
             const lanes m = rate * mu, b = t.b + rate * hooke_lambda(model, lam);
             int row = 0;
@@ -404,15 +406,16 @@ _HESSIAN = """
 """
 
 
-def _snippet(parts: str, body: str) -> str:
+def _snippet(body: str, more: str = "") -> str:
     """Return native code whose functions stand in a local struct, as a function's body has no other place for them."""
+    parts = _MATRICES + _LOGARITHM + SINGULAR_VALUES + ENERGY + DERIVATIVES + more + "    };\n" + LOADS
     models = ", ".join(f"{model.name} = {int(model)}" for model in MaterialModel)
-    text = f"{{\n    FUSED\n{_TYPES}    struct Eight {{\n        enum Model {{ {models} }};\n{parts}    }};\n{body}}}"
+    text = f"{{\n    FUSED\n{_TYPES}    struct Eight {{\n        enum Model {{ {models} }};\n{parts}{body}}}"
     return text.replace("FUSED", FUSED).replace("NOINLINE", "__attribute__((noinline))")
 
 
-_LOADS = """
-    lanes mu, lam, G[9], E[9], start[9], F[9];
+LOADS = """
+    lanes mu, lam, G[9], E[9], start[9], F[9], before[9], change[9], hooke[9];
     __builtin_memcpy(&mu, &mu_in, sizeof(mu));
     __builtin_memcpy(&lam, &lam_in, sizeof(lam));
     __builtin_memcpy(G, &G_in, sizeof(G));
@@ -420,32 +423,23 @@ _LOADS = """
     for (int k = 0; k < 9; ++k) F[k] = k % 4 == 0 ? 1.0 + G[k] : G[k];
     Eight::green_strain(G, E);
     // Hooke's law acts on the strain of STVK and, times the viscosity's rate, on its change in the step
-    lanes change[9], hooke[9];
-    if (rate > 0.0) {
-        lanes before[9];
-        Eight::green_strain(start, before);
-        for (int k = 0; k < 9; ++k) change[k] = E[k] - before[k];
-    }
+    if (rate > 0.0) Eight::green_strain(start, before);
     for (int k = 0; k < 9; ++k) {
+        change[k] = rate > 0.0 ? E[k] - before[k] : (lanes)0.0;
         hooke[k] = rate > 0.0 ? rate * change[k] : (lanes)0.0;
         if (model == Eight::STVK) hooke[k] += E[k];
     }
 """
 
 
-@wp.func_native(
-    snippet=_snippet(
-        _MATRICES + _LOGARITHM + _SINGULAR_VALUES + _ENERGY,
-        _LOADS
-        + """
-    lanes out[11], cof[9], T[9], S[9];
+_POINT = """
+    lanes out[11], cof[9], T[9], S[9], *P = out + 1;
     lanes j1 = Eight::trace(G) + Eight::second_invariant(G) + Eight::determinant(G);
     lanes strain = 2.0 * Eight::trace(G) + Eight::ddot(G, G);
     lanes psi = Eight::invariant_energy(model, mu, lam, E, j1);
     Eight::Derivatives t = Eight::invariant_derivatives(model, mu, lam, strain, j1);
     Eight::cofactor(G, cof);
     Eight::transpose(G, T);
-    lanes* P = out + 1;
     for (int k = 0; k < 9; ++k) P[k] = t.s * G[k] + t.p * (cof[k] - T[k]);
     for (int k = 0; k < 9; k += 4) P[k] += t.rest + t.p * Eight::trace(G);
     if (Eight::has_rotation(model)) {
@@ -471,9 +465,25 @@ _LOADS = """
     wp::mat_t<11, 8, wp::float64> found;
     __builtin_memcpy(&found, out, sizeof(found));
     return found;
-""",
-    )
-)
+"""
+
+_CURVATURE = """
+    wp::mat_t<54, 8, float> C;
+    float* out = (float*)&C;
+    // the stress F S of a strain's S changes by dF S too
+    lanes S[9];
+    Eight::hooke_stress(model, mu, lam, hooke, S);
+    if (project || Eight::has_rotation(model)) {
+        for (int k = 0; k < 9; ++k) S[k] = project ? (lanes)0.0 : S[k];
+        Eight::hessian_of_singular_values(model, mu, lam, rate, G, F, S, project, out);
+    } else {
+        Eight::hessian_of_invariants(model, mu, lam, model == Eight::STVK ? rate + 1.0 : rate, G, F, S, out);
+    }
+    return C;
+"""
+
+
+@wp.func_native(snippet=_snippet(_POINT))
 def energy_and_stress(
     model: int, mu_in: vec8d, lam_in: vec8d, rate: wp.float64, G_in: mat98d, G_start: mat98d
 ) -> PointLanes:  # pyright: ignore[reportReturnType]
@@ -490,26 +500,7 @@ def energy_and_stress(
     ...
 
 
-@wp.func_native(
-    snippet=_snippet(
-        _MATRICES + _LOGARITHM + _SINGULAR_VALUES + _ENERGY + _HESSIAN,
-        _LOADS
-        + """
-    wp::mat_t<54, 8, float> C;
-    float* out = (float*)&C;
-    // the stress F S of a strain's S changes by dF S too
-    lanes S[9];
-    Eight::hooke_stress(model, mu, lam, hooke, S);
-    if (project || Eight::has_rotation(model)) {
-        for (int k = 0; k < 9; ++k) S[k] = project ? (lanes)0.0 : S[k];
-        Eight::hessian_of_singular_values(model, mu, lam, rate, G, F, S, project, out);
-    } else {
-        Eight::hessian_of_invariants(model, mu, lam, model == Eight::STVK ? rate + 1.0 : rate, G, F, S, out);
-    }
-    return C;
-""",
-    )
-)
+@wp.func_native(snippet=_snippet(_CURVATURE, HESSIAN))
 def hessian_lanes(
     model: int, mu_in: vec8d, lam_in: vec8d, rate: wp.float64, G_in: mat98d, G_start: mat98d, project: int
 ) -> HessianLanes:  # pyright: ignore[reportReturnType]

@@ -73,13 +73,13 @@ def register_custom_attributes(builder: newton.ModelBuilder) -> None:
     declare("function_start", wp.int32, _INSTANCE, references=_FUNCTION)
     declare("particle_start", wp.int32, _INSTANCE, references="particle")
     declare("material_model self_contact", wp.int32, _INSTANCE)
-    # a contact_stiffness of 0 follows the body, see ``contact``
+    # a contact_stiffness of 0 follows the body, see ``penalty_kernels``
     declare(" ".join(MATERIAL_FIELDS) + " contact_stiffness contact_radius", wp.float32, _INSTANCE)
     declare("scale placed_scale", wp.float32, _INSTANCE, default=1.0)  # the latter: what the model's q and qd are for
     # q_before, qd_before: the step before, for BDF2 and for Newton's start; dt_before = 0 says that there is none
     declare("q qd q_before qd_before", wp.vec3d, _FUNCTION, **state)
     declare("dt_before", wp.float64, _INSTANCE, **state)
-    # friction's memory: the shapes that a surface sample sticks to, and where (see ``stick_kernels``);
+    # friction's memory: the shapes that a surface sample sticks to, and where (``friction_memory_kernels``);
     # and the soft bodies of its world that it sticks to, counted within the world, with its slip at rest
     particle = newton.Model.AttributeFrequency.PARTICLE
     declare("stick_shape stick_partner", wp.vec2i, particle, default=wp.vec2i(-1, -1), **state)

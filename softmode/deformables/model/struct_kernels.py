@@ -76,7 +76,7 @@ class Instances:
     mass_damping: wp.array[float]  # [1/s]
     friction: wp.array[float]
     area: wp.array[float]  # of the surface samples [m^2]
-    contact_stiffness: wp.array[float]  # [Pa/m], 0 where it follows the body; see ``contact.stiffness_per_area``
+    contact_stiffness: wp.array[float]  # [Pa/m], 0 where it follows the body; see ``stiffness_per_area``
     contact_radius: wp.array[float]  # how far the surface stands out [m]
     self_contact: wp.array[int]  # whether the body may touch itself
 
@@ -159,7 +159,7 @@ class Rigid:
     articulation_dof_start: wp.array[int]
     articulation_dof_count: wp.array[int]
     jacobian: wp.array3d[float]  # (articulation_count, 6 link_max, dof_max), twists of centres of mass, world frame
-    # MuJoCo's constraint rows, (world_count, row_max), see ``constraint_kernels``:
+    # MuJoCo's constraint rows, (world_count, row_max), see ``rigid_row_kernels``:
     row_count: wp.array[int]  # (world_count,)
     row_kind: wp.array2d[int]
     row_size: wp.array2d[int]  # rows of an elliptic cone, at its first

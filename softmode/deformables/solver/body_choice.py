@@ -17,7 +17,7 @@ from softmode.deformables.model.tables import allocate, starts_of
 from softmode.deformables.solver import body_choice_kernels as kernels
 from softmode.deformables.solver.iteration_kernels import NewtonArrays
 from softmode.deformables.solver.reduced_solver import ReducedSolver, require_reduced
-from softmode.deformables.solver.solver_reduced import require_driven_material
+from softmode.deformables.solver.solver_reduced import require_materials
 from softmode.errors import ConfigError
 
 _KEPT = ("rate", "volume_ratio", "constraint", "shape", "direction", "system_start", "rigid_tolerance")
@@ -53,7 +53,7 @@ class BodyChoice:
         if missing:
             what = f"bodies to choose from: {missing[0]!r} is not among the solver's"
             raise ConfigError(what, hint="give the solver all bodies")
-        require_driven_material([body.driven_count for body in bodies], [int(one.model) for one in materials])
+        require_materials([body.driven_count for body in bodies], [int(one.model) for one in materials])
         asset = np.array([known[body_key(body)] for body in bodies])
         points, samples = (
             np.array([getattr(body, name) for body in layout.bodies]) for name in ("point_count", "surface_count")

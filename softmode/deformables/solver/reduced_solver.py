@@ -120,10 +120,6 @@ class ReducedSolver(SolverBase):
         """
         self.tables.scaled.derive(self.checked_mask(world_mask))
 
-    def forget_hessians(self) -> None:
-        """Let the next step evaluate its elastic Hessians, also where ``carry_stiffness`` would carry them on."""
-        self.tables.newton.cached.zero_()
-
     def write_pins(self, instance: int, first: int, rows: np.ndarray, points: np.ndarray, count: int) -> None:
         """Give pins of a body other rest points, release them, and say how many pins the body has from now on.
 

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.materials.material_kernels import MaterialModel
+from softmode.deformables.materials.paths import require_models
 from softmode.deformables.model.authoring import (
     NAMESPACE,
     add_pins,
@@ -62,6 +63,7 @@ class SolverReduced(ReducedSolver):
 
     Raises:
         ConfigError: If a body of the model is not among ``bodies``, or a shape cannot be touched.
+        MaterialError: If a body has a material model that is not known.
     """
 
     def __init__(
@@ -88,7 +90,7 @@ class SolverReduced(ReducedSolver):
 
     def _check_materials(self) -> None:
         """Refuse materials that the bodies cannot have."""
-        require_driven_material(self.tables.instances.driven_count.numpy(), self.parameters.material_model.numpy())
+        require_materials(self.tables.instances.driven_count.numpy(), self.parameters.material_model.numpy())
 
     def notify_model_changed(self, flags: int) -> None:
         """Follow changes of the model: call it, with any flags, after a change of density, scale or material model.
@@ -207,8 +209,8 @@ class SolverReduced(ReducedSolver):
         last_phase.reset(self.tables, state, self.checked_mask(world_mask), flags)
 
 
-def require_driven_material(driven_counts: ArrayLike, models: ArrayLike) -> None:
-    """Refuse a material that a driven region may invert.
+def require_materials(driven_counts: ArrayLike, models: ArrayLike) -> None:
+    """Refuse a material that a driven region may invert, or whose model is not known.
 
     Args:
         driven_counts: Prescribed functions of each body.
@@ -216,7 +218,9 @@ def require_driven_material(driven_counts: ArrayLike, models: ArrayLike) -> None
 
     Raises:
         ConfigError: If a body with exact regions is NEO_HOOKEAN.
+        MaterialError: If a model is not known to all code that evaluates it.
     """
+    require_models(np.unique(models).tolist())
     if (np.asarray(driven_counts)[np.asarray(models) == int(MaterialModel.NEO_HOOKEAN)] > 0).any():
         raise ConfigError(
             "a body with exact regions has the material NEO_HOOKEAN, which a driven region may invert in one step",

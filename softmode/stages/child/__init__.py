@@ -1,4 +1,4 @@
-"""What runs in the process of its own that opens OpenUSD files: limits, checks, and reading; see `usd.process`.
+"""What runs in the process of its own that opens OpenUSD files: limits, checks, and reading.
 
-Nothing here imports softmode: the process starts this package alone, with usd-core.
+`softmode.stages.process` starts it. Nothing here imports softmode: the process has this package alone, and usd-core.
 """

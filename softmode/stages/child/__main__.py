@@ -1,4 +1,4 @@
-"""Start of the process that opens OpenUSD files; its one argument is the request as JSON, see `usd.process`."""
+"""Start of the process that opens OpenUSD files; its argument is a request of `softmode.stages.process`, as JSON."""
 
 from __future__ import annotations
 
