@@ -135,6 +135,20 @@ def test_a_hold_moves_and_turns_what_it_holds():
     )
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_hold_turns_the_short_way(sign):
+    """Half way to a right angle it has turned by half of that, whichever of q and -q says the goal."""
+    scene = GripScene(material=DAMPED)
+    grips = scene.grips[0]
+    number = grips.take(scene.points(1, 12), scene.state)
+    before, centre = grips.points(number, scene.state), grips.pose(number)[0]
+    grips.aim(number, centre, tuple(sign * np.array([0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)])))
+    grips.begin_frame(4)
+    scene.step(2)
+    turn = rotation((0, 0, 1), np.pi / 4)
+    np.testing.assert_allclose(grips.targets(number), centre + (before - centre) @ turn.T, atol=1e-12)
+
+
 def test_let_go_leaves_nothing_behind():
     """After a grip has been let go, and with idle slots, a step is that of a scene without slots, bit by bit."""
     scene, plain = GripScene(gravity=DOWN), GripScene(gravity=DOWN, slots=0)

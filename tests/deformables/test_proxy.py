@@ -17,7 +17,7 @@ from softmode.deformables.model.authoring import add_pins, add_reduced_body, reg
 from softmode.deformables.solver.solver_reduced import SolverReduced
 from softmode.errors import ConfigError
 from tests.bodies import cube
-from tests.scenes import GRAVITY, add_free_box
+from tests.scenes import GRAVITY, add_free_box, rotation, rotation_of
 
 EDGE = 0.1
 BOX = (0.05, 0.05, 0.02)
@@ -172,6 +172,13 @@ def test_free_body_alone():
     twist = out.body_qd.numpy()[body]
     np.testing.assert_allclose(twist, [0.1, 0.02, 0.0, 0.0, 0.0, 1e-4 / inertia[2, 2]], atol=1e-6)
     np.testing.assert_allclose(out.body_q.numpy()[body, :3], [1e-3, 2e-4, 1.0], atol=1e-6)
+    half, spin, dt = np.sqrt(0.5), 3.0, 0.01  # lying on its side it turns about the world's axis, not its own
+    state.body_q.assign(np.array([[0.0, 0.0, 1.0, half, 0.0, 0.0, half]], np.float32))
+    state.body_qd.assign(np.array([[0.0, 0.0, 0.0, 0.0, 0.0, spin]], np.float32))
+    state.body_f.zero_()
+    solver.step(state, out, None, None, dt)
+    turned = rotation((0, 0, 1), spin * dt) @ rotation((1, 0, 0), np.pi / 2)
+    np.testing.assert_allclose(rotation_of(out.body_q.numpy()[body, 3:]), turned, atol=(spin * dt) ** 3)
 
 
 def test_effective_mass_of_a_sample():
