@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import newton
 import numpy as np
 import pytest
 import warp as wp
+from scipy.spatial.transform import Rotation
 
 from softmode import robots
 from softmode.errors import ConfigError
@@ -25,17 +27,23 @@ def placed(tmp_path_factory: pytest.TempPathFactory) -> TableRobot:
 
 
 def test_forward_is_the_compiler_s(tmp_path: Path) -> None:
-    """The product of exponentials gives MuJoCo's tool pose, at any coordinates."""
+    """The product of exponentials gives MuJoCo's tool pose, at any coordinates, also of a frame in a turned tool."""
+    half = np.sqrt(0.5)
     robot = robots.load(write_arm5(tmp_path))
-    chain = serial_chain(robot)
+    robot = dataclasses.replace(robot, tool=(*robot.tool[:3], half, 0.0, 0.0, half))
+    frame = (0.01, -0.02, 0.03, 0.0, half, 0.0, half)
+    chain, framed = serial_chain(robot), serial_chain(robot, frame)
     random = np.random.default_rng(1)
     q = random.uniform(*chain.span, (5, 5))
     position, rotation = chain.forward(q)
+    place, turn = framed.forward(q)
     for k in range(5):
         pose = robot.tool_pose([*q[k], 0.0, 0.0])
         np.testing.assert_allclose(position[k], pose[:3], atol=1e-9)
-        turned = wp.quat_rotate(wp.quatd(*pose[3:]), wp.vec3d(1.0, 0.0, 0.0))
-        np.testing.assert_allclose(rotation[k, :, 0], turned, atol=1e-9)
+        tool = Rotation.from_quat(pose[3:])
+        np.testing.assert_allclose(rotation[k], tool.as_matrix(), atol=1e-9)
+        np.testing.assert_allclose(place[k], pose[:3] + tool.apply(frame[:3]), atol=1e-9)
+        np.testing.assert_allclose(turn[k], (tool * Rotation.from_quat(frame[3:])).as_matrix(), atol=1e-9)
 
 
 def test_jacobian_by_differences(tmp_path: Path) -> None:
