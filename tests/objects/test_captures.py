@@ -16,7 +16,8 @@ from softmode.errors import AssetError
 from softmode.objects import ObjectConfig, load
 from softmode.objects.loader import object_config
 from softmode.objects.object_build import build_object
-from softmode.objects.source import object_source, standing_quadrature
+from softmode.objects.pipeline import standing_quadrature
+from softmode.objects.source import object_source
 from softmode.splats.colored_mesh import ColoredMesh
 from softmode.splats.point_cloud import splats_from_points
 from tests.captures import CAPTURES, SHELLS, cup, guitar, hollow_ball, render_shell
