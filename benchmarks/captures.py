@@ -17,7 +17,8 @@ import numpy as np
 
 from softmode.deformables.build.quadrature import quadrature_from_points, quadrature_from_splats
 from softmode.objects import ObjectConfig, load
-from softmode.objects.source import object_source, standing_quadrature
+from softmode.objects.pipeline import standing_quadrature
+from softmode.objects.source import object_source
 from softmode.splats.formats import write_splats
 from tests.captures import CAPTURES, SHELLS, render_shell
 

@@ -125,11 +125,16 @@ def test_a_crop_cures_the_floater(assets: Path, capsys: pytest.CaptureFixture[st
 
 
 def test_regions_and_stiffness_are_given_where_the_object_stands(assets: Path, tmp_path: Path) -> None:
-    """On z = 0, centred: the lower centimetre is held exactly, the half x > 0 is ten times as stiff."""
+    """On z = 0, centred: the lower centimetre is held exactly, the half x > 0 is ten times as stiff, and denser.
+
+    What is not said, such as the number of surface samples, is as everywhere.
+    """
     out = tmp_path / "box.npz"
+    np.savez(tmp_path / "dense.npz", points=[[-0.01, 0.0, 0.0], [0.01, 0.0, 0.0]], factors=[1.0, 3.0])
     wide = "-inf,-inf,{},inf,inf,{}"
     regions = ["--region", "foot=" + wide.format("-inf", 0.01), "top=" + wide.format(0.035, "inf") + ",1e6"]
     stiffness = ["--stiffness", "half=0,-inf,-inf,inf,inf,inf,10"]
+    stiffness += ["--density-file", str(tmp_path / "dense.npz")]
     size = ["--size", "0.05", "--modes", "2", "--kernels", "60", "--points", "200"]
     assert main(["body", "build", str(assets / "box.obj"), "-o", str(out), *size, *regions, *stiffness]) == 0
     body = ReducedBody.load(out)
@@ -138,6 +143,8 @@ def test_regions_and_stiffness_are_given_where_the_object_stands(assets: Path, t
     np.testing.assert_allclose(body.region_cores[0, 1, 2] + body.offset[2], body.bounds[0, 2] + body.offset[2] + 0.01)
     right = body.points[:, 0] + body.offset[0] > 0.0
     assert set(body.stiffness_scale[right]) == {10.0} and set(body.stiffness_scale[~right]) == {1.0}
+    assert body.offset[0] == pytest.approx(0.5 * 0.0125, rel=0.01)  # (3 - 1) / (3 + 1) of a quarter of the box's edge
+    assert body.surface_count == ObjectConfig().surface_count and body.provenance["option_poissons_ratio"] is None
     assert main(["body", "check", str(out)]) == 0
 
 

@@ -47,14 +47,15 @@ class _Asset:
     """Reproducing kernels; 1000 if omitted, 400 with eigenmodes."""
     points: int = 384
     """Cubature points, at which a step evaluates stress."""
-    surface: int = 400
-    """Surface samples, which feel contact."""
+    surface: int | None = None
+    """Surface samples, which feel contact; 800 if omitted."""
     splats: int | None = None
     """Splats on a mesh, 2000 if omitted, or on a preset, 6000; a splat file keeps its own."""
     rank_tolerance: float | None = None
     """Functions smaller than this are dropped as noise; 1e-5 if omitted, 1e-9 for slender and flat bodies."""
-    poissons_ratio: tuple[float, ...] = (0.4,)
-    """Poisson's ratio that the functions are made for; any other can be simulated, several serve one that varies."""
+    poissons_ratio: tuple[float, ...] = ()
+    """Poisson's ratio that the functions are made for; a preset's own, else 0.4, if omitted. Any other can be
+    simulated, several serve one that varies."""
     region: tuple[str, ...] = ()
     """NAME=x0,y0,z0,x1,y1,z1: a part that scenes hold, move or grasp [m]; a seventh number makes it soft, stiffness / E
     [1/m^2]. Coordinates: z up, bounding box centred over the origin, standing on z = 0; inf is allowed."""
@@ -202,16 +203,14 @@ class BodyCut(_Asset):
             raise ConfigError(f"out {self.out} is no .npz file", hint="name it like toy.npz")
         base = self.path.with_suffix(".npz") if self.out is None else self.out
         check_place(base, "file", make_folders=False)
-        import numpy as np
-
         from softmode.deformables.build.patch import Patch
         from softmode.objects.cut import cut_object
         from softmode.objects.object_file import write_object
+        from softmode.objects.pose import seat_of
 
         thing, _ = _examined(self)
         body = thing.body
-        low, high = body.bounds + body.offset
-        seat = np.array([*(0.5 * (low + high))[:2], low[2]])
+        seat = seat_of(body.bounds + body.offset)
         parts = [thing]
         for numbers in planes:
             patch = Patch.plane(seat + numbers[:3], numbers[3:])
@@ -262,10 +261,12 @@ def _examined(options: _Asset) -> tuple[SoftObject, BodyReport]:
     else:
         given = same_fields(options, BuildOptions)
         given |= {"mode_count": options.modes, "kernel_count": options.kernels, "cubature_count": options.points}
-        given["function_count"] = options.functions
+        given |= {"function_count": options.functions, "poissons_ratio": options.poissons_ratio or None}
         if options.rank_tolerance is None:
             given["rank_tolerance"] = RANK_TOLERANCE
-        counts = {"surface_count": options.surface, "splat_count": options.splats}
+        counts: dict[str, int | None] = {"splat_count": options.splats}
+        if options.surface is not None:
+            counts["surface_count"] = options.surface
         config = dataclasses.replace(toy.object_of(ObjectConfig()), **counts, build=BuildOptions(**given))
         found, quadrature = build_object(config, regions=[_region(text) for text in options.region])
     body, splats = found.body, found.visible_splats

@@ -176,6 +176,11 @@ class ObjectConfig:
                 raise ConfigError(f"colors {self.colors} are not two colours", hint="give two of (r, g, b) in 0..1")
 
     @property
+    def kind(self) -> str:
+        """What it is made from: "preset", "splat", "mesh", "radiance" or "body", else its shape."""
+        return next((kind for kind in ("preset", *FILES) if getattr(self, kind) is not None), self.shape)
+
+    @property
     def longest_edge(self) -> float | None:
         """Longest edge that it is brought to [m]; None for what has its own: shapes, bodies, most presets."""
         if self.body is not None or self.extents is not None:

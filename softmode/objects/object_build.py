@@ -2,29 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from softmode.deformables.body.regions import Region
-from softmode.deformables.build.build_body import build_body
 from softmode.deformables.build.quadrature_grid import Quadrature
 from softmode.deformables.materials.material import Material
-from softmode.errors import ConfigError
 from softmode.objects.loader import Progress, object_config
+from softmode.objects.pipeline import build_standing, dressed
 from softmode.objects.soft_object import SoftObject
-from softmode.objects.source import (
-    field_of_body,
-    object_source,
-    splats_of_body,
-    standing_quadrature,
-    stiffness_scale,
-    with_origin,
-)
+from softmode.objects.source import object_source
 
 if TYPE_CHECKING:
     from softmode.objects.loader import Source
@@ -60,30 +48,7 @@ def build_object(
         BasisError: If the basis cannot be built, or a region holds too little.
     """
     config = object_config(source, **options)
-    material = material or config.material
-    if config.body is not None:
-        raise ConfigError(f"{config.body} is a body already", hint="give the file that it was built from")
     parts = object_source(config)
-    quadrature, turn = standing_quadrature(config, parts)
-    low, high = quadrature.bounds
-    seat = np.array([*(0.5 * (low + high))[:2], low[2]])
-    body = build_body(
-        quadrature,
-        config.for_material(material).build,
-        name=parts.name,
-        regions=[region.moved(-seat, quadrature.bounds) for region in regions],
-        stiffness_scale=stiffness_scale(config, quadrature, parts, turn),
-        progress=progress,
-    )
-    splats = splats_of_body(parts.splats, body, turn)
-    frame = {"turn": json.dumps(turn.tolist()), "seat": json.dumps(seat.tolist())}
-    body = with_origin(replace(body, provenance={**body.provenance, **frame}), config, parts, splats)
-    found = SoftObject(
-        body=body,
-        splats=splats,
-        material=material,
-        contact_radius=config.contact_radius,
-        config=config,
-        radiance=field_of_body(parts, body, turn),
-    )
-    return found, quadrature
+    material = material or config.material
+    body, quadrature = build_standing(config.for_material(material), parts, regions=regions, progress=progress)
+    return dressed(body, config, parts, material), quadrature

@@ -12,6 +12,12 @@ STABLE_RISE = 0.003
 """By this fraction of its height at least: the facets between samples of a round rim, on which it rolls, are lower."""
 
 
+def seat_of(bounds: NDArray) -> NDArray:
+    """Return where an object stands: the middle of the lower face of its bounding box (2, 3)."""
+    low, high = bounds
+    return np.array([*(0.5 * (low + high))[:2], low[2]])
+
+
 def stable_rotation(points: NDArray[np.float64]) -> NDArray[np.float64] | None:
     """Return the least rotation after which an object stands stably, None if it does so already or never does.
 

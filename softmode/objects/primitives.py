@@ -89,17 +89,22 @@ def primitive_quadrature(shape: Primitive, extents: Extents, surface_count: int)
     axis, radius, length = _round(shape, extents)
     found = quadrature_from_capsule(radius, max(0.5 * length - radius, 0.0), surface_count=surface_count)
     half = 0.5 * np.asarray(extents, dtype=np.float64)
-    return replace(turned(found, _along(axis)), bounds=np.stack([-half, half]))
+    return replace(turned(found, _along(axis), found.surface_points), bounds=np.stack([-half, half]))
 
 
-def turned(quadrature: Quadrature, rotation: ArrayLike) -> Quadrature:
-    """Return the quadrature after a rotation (3, 3); the same points, so that a stable pose stays one."""
-    turn, cells = np.asarray(rotation, dtype=np.float64), quadrature.cells
-    surface = quadrature.surface_points @ turn.T
+def turned(quadrature: Quadrature, rotation: Array, outline: Array) -> Quadrature:
+    """Return the quadrature after a rotation; the same points, so that a stable pose stays one.
+
+    Args:
+        quadrature: The solid.
+        rotation: The rotation, shape (3, 3).
+        outline: Points on its surface that span its new bounding box [m], shape (H, 3).
+    """
+    turn, cells, surface = rotation, quadrature.cells, outline @ rotation.T
     return replace(
         quadrature,
         points=quadrature.points @ turn.T,
-        surface_points=surface,
+        surface_points=quadrature.surface_points @ turn.T,
         surface_normals=quadrature.surface_normals @ turn.T,
         bounds=np.stack([surface.min(axis=0), surface.max(axis=0)]),
         cells=cells

@@ -22,8 +22,9 @@ from softmode.errors import AssetError, needs_extra
 from softmode.mpm import MORPH_MATERIAL, ParticleBody, particles_from_shape
 from softmode.objects.config import ObjectConfig
 from softmode.objects.object_file import file_kind
+from softmode.objects.pipeline import standing_quadrature
 from softmode.objects.primitives import KEY_LIGHT, Color, checker
-from softmode.objects.source import DEFAULT_COLORS, object_source, standing_quadrature
+from softmode.objects.source import DEFAULT_COLORS, object_source
 from softmode.splats.mesh_samples import eliminate_samples
 from softmode.splats.point_cloud import splats_from_points
 from softmode.splats.splats import Splats

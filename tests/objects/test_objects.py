@@ -10,7 +10,7 @@ import pytest
 
 from softmode.deformables.build.options import BuildOptions
 from softmode.errors import AssetError, ConfigError
-from softmode.objects import ObjectConfig, load, loader
+from softmode.objects import ObjectConfig, load, pipeline
 from softmode.objects.parts import Part, choose_part
 from softmode.objects.pose import stable_rotation
 from softmode.objects.source import object_source
@@ -167,7 +167,7 @@ def test_body_comes_from_the_cache_the_second_time(tmp_path: Path, monkeypatch: 
     write_ply(file, shell(800, 1.0, (0.0, 0.0, 0.0)))
     config = ObjectConfig(splat=file, size=0.05)
     first = load(config)
-    monkeypatch.setattr(loader, "build_body", lambda *_, **__: pytest.fail("built again"))
+    monkeypatch.setattr(pipeline, "build_body", lambda *_, **__: pytest.fail("built again"))
     second = load(config)
     np.testing.assert_array_equal(first.basis, second.basis)
     np.testing.assert_array_equal(first.visible_splats.means, second.visible_splats.means)

@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from softmode.errors import ConfigError, GraspError
 from softmode.objects import ObjectConfig
-from softmode.objects.source import object_source, standing_quadrature
+from softmode.objects.pipeline import standing_quadrature
+from softmode.objects.source import object_source
 from softmode.robots import ArmDescription, Grasp, ParallelJaw, plan_grasps
 from softmode.robots.grasp_planner import DEPTH, MARGIN
 from tests.captures import CAPTURES

@@ -1,0 +1,202 @@
+"""One line of stages from what an object is made of to the object: it stands, is reduced, and gets its splats.
+
+`load` and `build_object` are its entrances: :func:`softmode.objects.source.object_source` reads, what follows is here.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.body.regions import Region
+from softmode.deformables.build.build_body import Progress, build_body
+from softmode.deformables.build.quadrature_grid import Quadrature
+from softmode.deformables.build.surface_samples import SURFACE_COUNT
+from softmode.deformables.materials.material import Material
+from softmode.errors import AssetError, ConfigError
+from softmode.objects.config import FIELD_FILES, FILES, ObjectConfig
+from softmode.objects.paint import color_field, read_field
+from softmode.objects.pose import seat_of, stable_rotation
+from softmode.objects.presets import find_preset
+from softmode.objects.primitives import scaled, turned
+from softmode.objects.soft_object import SoftObject
+from softmode.objects.source import ObjectSource
+from softmode.splats.splats import Splats
+
+Array = NDArray[np.float64]
+
+RECIPE = 7
+"""Part of the cache key; raise it when the way from a file or shape to a body changes."""
+SIZE_TOLERANCE = 0.02
+"""Relative error of the size of a fill that is left: bumps of that height lie on its surface."""
+
+
+def body_key(config: ObjectConfig, source: ObjectSource) -> tuple[object, ...]:
+    """Return what the body of an object depends on.
+
+    Raises:
+        AssetError: If a file of factors is missing.
+    """
+    fields = {name: Path(file) for name in FIELD_FILES if (file := getattr(config, name)) is not None}
+    for name, file in fields.items():
+        if not file.is_file():
+            raise AssetError(f"{name} {file}: no such file", hint="check the path")
+    colors = (config.stiffness_colors, config.density_colors)
+    painted = (colors, source.splats.means, source.splats.sh) if any(colors) else ()  # A mesh's key has no colours.
+    held = (config.surface_count, config.build, config.clamped_height, config.stiffness)
+    return (RECIPE, *source.key, _may_turn(config), *held, painted, fields)
+
+
+def standing_quadrature(config: ObjectConfig, source: ObjectSource) -> tuple[Quadrature, Array]:
+    """Integrate an object, bring it to its size, and lay it on a stable side if its pose is to be stable.
+
+    Samples say which side is stable: twice as many turned a banana by 3 degrees more. So they and the bounding box are
+    those of the default number, whatever number touches.
+
+    Args:
+        config: Which object.
+        source: What it is made of.
+
+    Returns:
+        The quadrature, and the rotation times the factor that was applied, shape (3, 3).
+
+    Raises:
+        AssetError: If it encloses no volume.
+    """
+    try:
+        quadrature = source.integrate()
+        turns = _may_turn(config) and config.surface_count != SURFACE_COUNT
+        like = source.integrate(surface_count=SURFACE_COUNT) if turns else quadrature
+    except AssetError as error:
+        raise AssetError(f"{source.splats.name}: {error.message}", hint=error.hint) from error
+    quadrature = replace(quadrature, bounds=like.bounds, report={**quadrature.report, **source.capture})
+    outline, factor, turn = like.surface_points, 1.0, None
+    if source.fill_size is not None:
+        extent = float(np.ptp(quadrature.bounds, axis=0).max())
+        if abs(extent / source.fill_size - 1.0) > SIZE_TOLERANCE:
+            factor = source.fill_size / extent
+            quadrature, outline = scaled(quadrature, factor), outline * factor
+    if _may_turn(config):
+        turn = stable_rotation(outline - quadrature.weights @ quadrature.points / quadrature.volume)
+    return (quadrature, factor * np.eye(3)) if turn is None else (turned(quadrature, turn, outline), factor * turn)
+
+
+def relative_scale(
+    config: ObjectConfig, name: Literal["stiffness", "density"], quadrature: Quadrature, splats: Splats
+) -> Array | None:
+    """Return the relative stiffness or density per quadrature point (P,), None if it is the same everywhere.
+
+    Args:
+        config: Which object.
+        name: Which of the two.
+        quadrature: Its solid, as it stands.
+        splats: What shows it there.
+
+    Raises:
+        AssetError: If a file cannot be read.
+        ConfigError: If a part of another stiffness holds no point, or no splat has the colour of one.
+    """
+    boxes = config.stiffness if name == "stiffness" else ()
+    colors, file = getattr(config, f"{name}_colors"), getattr(config, f"{name}_file")
+    if not boxes and not colors and file is None:
+        return None
+    points = quadrature.points - seat_of(quadrature.bounds)
+    found = np.ones(len(points))
+    for part in boxes:
+        inside = (points >= part.box[:3]).all(axis=1) & (points <= part.box[3:]).all(axis=1)
+        if not inside.any():
+            low, high = np.round([points.min(axis=0), points.max(axis=0)], 4).tolist()
+            raise ConfigError(
+                f"stiffness: box {part.box} holds no point of the object", hint=f"the object fills {low} to {high} m"
+            )
+        found[inside] = part.factor
+    if colors:
+        found *= color_field(splats, colors)(quadrature.points)
+    if file is not None:
+        found *= read_field(file)(points)
+    return found
+
+
+def build_standing(
+    config: ObjectConfig, source: ObjectSource, *, regions: Sequence[Region] = (), progress: bool | Progress | None
+) -> tuple[ReducedBody, Quadrature]:
+    """Reduce an object as it stands.
+
+    Args:
+        config: Which object.
+        source: What it is made of.
+        regions: Parts that a scene holds, moves or grasps, beside the foot of a clamped object, where it stands.
+        progress: Passed to :func:`softmode.deformables.build.build_body.build_body`.
+
+    Returns:
+        The body, whose `provenance` tells how it was laid down ("turn") and where it stands ("seat"), and its solid.
+    """
+    quadrature, turn = standing_quadrature(config, source)
+    seat, splats = seat_of(quadrature.bounds), _laid_down(source.splats, turn)
+    held = [region.moved(-seat, quadrature.bounds) for region in regions]
+    if config.clamped_height > 0.0:
+        wide = float("inf")
+        top = float(seat[2]) + config.clamped_height
+        held.append(Region(name="foot", box=((-wide,) * 3, (wide, wide, top))))
+    body = build_body(
+        quadrature,
+        config.build,
+        name=source.name,
+        regions=held,
+        stiffness_scale=relative_scale(config, "stiffness", quadrature, splats),
+        density_scale=relative_scale(config, "density", quadrature, splats),
+        progress=progress,
+    )
+    frame = {"turn": json.dumps(turn.tolist()), "seat": json.dumps(seat.tolist())}
+    return replace(body, provenance={**body.provenance, **frame}), quadrature
+
+
+def dressed(body: ReducedBody, config: ObjectConfig, source: ObjectSource, material: Material | None) -> SoftObject:
+    """Return a body with the splats and the field of its source in its frame; its provenance tells the asset.
+
+    What lies beyond an eighth of the body's size around its bounding box are floaters of the capture: left out.
+    """
+    turn = np.array(json.loads(str(body.provenance["turn"])))
+    splats = _laid_down(source.splats, turn)
+    low, high = body.bounds + body.offset
+    margin = 0.125 * np.linalg.norm(high - low)
+    near = ((splats.means >= low - margin) & (splats.means <= high + margin)).all(axis=1)
+    splats = splats.subset(near).transformed(translation=-body.offset)
+    told = {
+        "asset": source.name,
+        "asset_kind": config.kind,
+        "asset_splats": source.asset_splats,
+        "asset_left_out": source.asset_splats - splats.count,
+    }
+    if config.preset is not None:
+        told["material"] = json.dumps(find_preset(config.preset).properties)
+    factor, field = float(np.cbrt(np.linalg.det(turn))), source.radiance
+    return SoftObject(
+        body=replace(body, provenance={**body.provenance, **told}),
+        splats=splats,
+        material=material,
+        contact_radius=config.contact_radius,
+        config=config,
+        radiance=None if field is None else field.transformed(turn / factor, -body.offset, factor),
+    )
+
+
+def _may_turn(config: ObjectConfig) -> bool:
+    """Return whether an object is laid on a stable side if it has to be."""
+    return config.pose == "stable" and config.kind in ("preset", *FILES)
+
+
+def _laid_down(splats: Splats, turn: Array) -> Splats:
+    """Return splats after the rotation times a factor that laid their solid down."""
+    if np.array_equal(turn, np.eye(3)):
+        return splats
+    factor = float(np.cbrt(np.linalg.det(turn)))
+    rotation = turn / factor
+    return splats.transformed(None if np.allclose(rotation, np.eye(3), atol=1e-12) else rotation, scale=factor)
