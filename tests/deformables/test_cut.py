@@ -104,10 +104,12 @@ def test_mass_and_momentum_are_conserved(bar: ReducedBody, halves: tuple[Reduced
     np.testing.assert_allclose(turn, spin(bar, affine, qd), atol=1e-9 * scale)
 
 
-def test_a_varying_density_is_that_of_the_parts(bar: ReducedBody) -> None:
-    """Mass and momentum of a bar that is heavier at one end, with the densities that the cut tells."""
+def test_fields_go_with_their_part() -> None:
+    """Stiff points stay stiff; mass and momentum of a bar that is heavier at one end, with the densities of the cut."""
     quadrature = quadrature_from_box(SIZE, point_count=1000, surface_count=100)
-    heavy = build_body(quadrature, OPTIONS, density_scale=lambda X: 1.0 + 30.0 * (X[:, 0] + 0.1), progress=False)
+    fields = {"density_scale": lambda X: 1.0 + 30.0 * (X[:, 0] + 0.1)}
+    fields["stiffness_scale"] = lambda X: np.where(X[:, 0] > 0.0, 8.0, 1.0)
+    heavy = build_body(quadrature, OPTIONS, **fields, progress=False)
     cut = cut_body(heavy, MIDDLE)
     mass = [density * part.volume for density, part in zip(cut.densities, cut.bodies, strict=True)]
     assert abs(sum(mass) / heavy.volume - 1.0) < 1e-12 and cut.densities[1] < 0.9 < 1.1 < cut.densities[0]
@@ -118,6 +120,9 @@ def test_a_varying_density_is_that_of_the_parts(bar: ReducedBody) -> None:
     np.testing.assert_allclose(
         after, heavy.volume * heavy.mean_basis @ qd, atol=1e-9 * heavy.volume * np.linalg.norm(qd)
     )
+    for part in cut.bodies:
+        stiff = np.where(part.points[:, 0] + part.offset[0] > 0.0, 8.0, 1.0)
+        np.testing.assert_array_equal(part.stiffness_scale, stiff)
 
 
 def world(parts: tuple[ReducedBody, ...], origin: NDArray[np.float64], pinned: int | None = None) -> Any:
@@ -329,16 +334,6 @@ def test_a_soft_region_is_cut_through(bar: ReducedBody) -> None:
     before = held.volume * held.mean_basis @ qd
     np.testing.assert_allclose(after, before, atol=5e-3 * np.linalg.norm(before))  # cells at the soft region differ
     assert len(cut_body(held, Patch.plane((-0.05, 0.0, 0.0), (1.0, 0.0, 0.0))).bodies) == 2
-
-
-def test_fields_go_with_their_part(bar: ReducedBody) -> None:
-    """Stiff points stay stiff."""
-    given = quadrature_from_box(SIZE, point_count=1000, surface_count=100)
-    body = build_body(given, OPTIONS, stiffness_scale=lambda X: np.where(X[:, 0] > 0.0, 8.0, 1.0), progress=False)
-    for part in cut_body(body, MIDDLE).bodies:
-        np.testing.assert_array_equal(
-            part.stiffness_scale, np.where(part.points[:, 0] + part.offset[0] > 0.0, 8.0, 1.0)
-        )
 
 
 def test_a_part_is_an_ordinary_body(halves: tuple[ReducedBody, ...], tmp_path) -> None:

@@ -9,6 +9,7 @@ import pytest
 from benchmarks.accuracy import affine
 from benchmarks.accuracy_runner import Result, Row, run
 from softmode.deformables.build.options import BuildOptions
+from tests.marks import rest_but
 
 MARGIN = 1.3
 """Slack over the measured figures: the build's choices (kernels, cubature) may move within it, the method may not."""
@@ -36,6 +37,7 @@ def test_bend_is_as_accurate_as_measured():
     assert bend(9).status == 0
 
 
+@pytest.mark.rest
 def test_bend_improves_with_modes():
     """More eigenmodes never make the bend less accurate."""
     errors = [bend(m).nmse for m in (6, 9, 16)]
@@ -56,6 +58,7 @@ def test_free_body_is_as_accurate_as_measured():
     assert spin(9).nmse < 1e-6
 
 
+@pytest.mark.rest
 def test_known_clamp_reaches_the_target():
     """0.5 m held exactly in both: static responses bring the bend under 2e-5 with at most 120 unknowns.
 
@@ -71,7 +74,9 @@ def test_known_clamp_reaches_the_target():
     assert errors[True] < 1e-2 * errors[False]
 
 
-@pytest.mark.parametrize(("scene", "count", "bound"), [("bend", 40, 2e-5), ("twist_360", 53, 5e-6)])
+@pytest.mark.parametrize(
+    ("scene", "count", "bound"), rest_but([("bend", 40, 2e-5)], [("bend", 40, 2e-5), ("twist_360", 53, 5e-6)])
+)
 def test_functions_chosen_for_a_held_body(scene: str, count: int, bound: float):
     """Chosen by elastic energy, they carry a bend and a whole turn between two clamps: 2.8e-6 with 159 unknowns."""
     options = BuildOptions(function_count=count)
