@@ -62,7 +62,7 @@ def _one(add: str, **given: Any) -> Any:
 def test_bounds_and_volume(
     add: str, given: dict[str, Any], half: tuple[float, ...], volume: float, loss: float
 ) -> None:
-    """Bounds are those of the shape; the volume is the closed form less what inscribed facets lose, faces outwards."""
+    """Bounds are the shape's; the volume is the closed form less what facets lose; faces outwards, turned too."""
     mesh = _one(add, **given)
     np.testing.assert_allclose(np.abs(mesh.vertices).max(axis=0), half, rtol=1e-2 if loss > 1e-3 else 1e-6)
     assert (np.abs(mesh.vertices) <= np.array(half) * (1 + 1e-6)).all()
@@ -72,6 +72,11 @@ def test_bounds_and_volume(
     real = np.linalg.norm(facing, axis=1) > 1e-9
     assert (np.einsum("fj,fkj->fk", facing, mesh.normals[mesh.faces])[real] > 0.0).all()
     np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1.0, atol=1e-5)
+    turn = wp.quat_rpy(0.3, -0.4, 0.5)
+    turned = _one(add, **given, xform=wp.transform(wp.vec3(0.1, 0.2, 0.3), turn))
+    R = np.array(wp.quat_to_matrix(turn)).reshape(3, 3)
+    np.testing.assert_allclose(turned.vertices, mesh.vertices @ R.T + [0.1, 0.2, 0.3], atol=1e-6)
+    np.testing.assert_allclose(turned.normals, mesh.normals @ R.T, atol=1e-5)
 
 
 def test_meshes_are_cut_along_creases() -> None:
