@@ -20,6 +20,8 @@ from softmode.errors import AssetError, ConfigError, MissingExtraError, StorageE
 from softmode.objects import Placed, SoftObject
 from softmode.usd import UsdExportOptions, add_usd, write_usd, writer
 from softmode.usd.handles import handles_from_coordinates
+from softmode.usd.writer import set_place
+from tests.scenes import rotation
 from tests.usd.export_scenes import (
     KINDS,
     MATERIAL,
@@ -70,6 +72,19 @@ def test_round_trip_is_exact(tmp_path: Path, kind: str, suffix: str, coefficient
     np.testing.assert_allclose(found.rotation, toy.rotation, atol=1e-15)
     assert found.scale == pytest.approx(toy.scale, rel=1e-15)
     assert [path.name for path in tmp_path.iterdir()] == [f"toy.{suffix}"]
+
+
+def test_places_turn_the_short_way() -> None:
+    """Turned on and on, past half a turn and a whole one, a place is right at its samples and half way between them."""
+    Usd, UsdGeom = (importlib.import_module(f"pxr.{name}") for name in ("Usd", "UsdGeom"))
+    stage = Usd.Stage.CreateInMemory()  # which lives as long as its prims are used
+    root = UsdGeom.Xform.Define(stage, "/Root")
+    for frame in range(9):
+        set_place(root, (0.1, 0.2, 0.3), rotation((0.6, 0.0, 0.8), 0.9 * frame), 1.0, frame)
+    for time in np.arange(0.0, 8.1, 0.5):
+        matrix = np.array(root.GetLocalTransformation(time))
+        np.testing.assert_allclose(matrix[:3, :3].T, rotation((0.6, 0.0, 0.8), 0.9 * time), atol=1e-9)
+        np.testing.assert_allclose(matrix[3, :3], (0.1, 0.2, 0.3))
 
 
 def test_several_bodies_and_odd_names(tmp_path: Path) -> None:

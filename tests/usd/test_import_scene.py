@@ -124,6 +124,11 @@ def test_material_of_ancestors_and_purposes(tmp_path: Path) -> None:
     default = Material(density=123.0, poissons_ratio=0.3)
     material = found.material(VOLUME, default)
     assert (material.youngs_modulus, material.density, material.poissons_ratio) == (1e4, 123.0, 0.3)
+    geometry = author.stage.GetPrimAtPath("/World/Group/Toy/Geometry")  # its own binding goes before the body's
+    hard = author.material("/World/Hard", "aousd", {"youngsModulus": 2e4})
+    UsdShade.MaterialBindingAPI.Apply(geometry).Bind(hard, UsdShade.Tokens.weakerThanDescendants, "physics")
+    author.save()
+    assert read_one(tmp_path / "a.usda").properties == {"youngs_modulus": 2e4}
 
 
 def test_mass_goes_before_density(tmp_path: Path) -> None:

@@ -191,6 +191,9 @@ def test_episode_is_what_the_environment_did(env: Any, tmp_path: Path) -> None:
         picture = np.asarray(Image.open(io.BytesIO(np.asarray(blobs[steps][0], np.uint8).tobytes())), float)
         exact = drawn.images(name).numpy()[0].astype(float)
         assert np.abs(picture - exact).mean() < 4.0
+        matrix = drawn.extrinsics(name).numpy()[0]  # from the world to the camera
+        (place,) = file.of(f"scene/camera/{name}", "Transform3D:translation")[0]
+        np.testing.assert_allclose(matrix[:3, :3] @ place, -matrix[:3, 3], atol=1e-6)
         blob = file.of(f"scene/camera/{name}/depth", "EncodedDepthImage:blob")[steps][0]
         depth = np.asarray(Image.open(io.BytesIO(np.asarray(blob, np.uint8).tobytes())), float) * 1e-4
         np.testing.assert_allclose(depth, drawn.images(name, "depth").numpy()[0], atol=5.1e-5)
