@@ -26,7 +26,7 @@ from softmode.view.prepare import ARC, PreparePage
 from tests.view.page_client import PageClient
 from tests.view.test_browser import CHROMIUM, FLAGS, playwright, until
 
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed")
+pytestmark = [pytest.mark.browser, pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed")]
 SIZE = (1100, 480)
 """Width and height of the page [px]; the panel lies beside the gizmos."""
 ARROW = 0.22
