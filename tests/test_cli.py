@@ -15,6 +15,7 @@ import pytest
 import trimesh
 from PIL import Image
 
+import softmode
 from softmode.cli.main import main
 from softmode.envs.markers import dots
 from softmode.splats import make_plush, write_ply, write_splats
@@ -86,6 +87,7 @@ def test_play_films_a_room_as_a_gif(
     assert "Give --video" in capsys.readouterr().err
 
 
+@pytest.mark.rest
 def test_play_lifts_a_trained_capture(capsys: pytest.CaptureFixture[str]) -> None:
     """The scripted policy lifts the robot out of a trained SOG capture."""
     if not PLAYBOT.is_file():
@@ -243,7 +245,7 @@ def test_unknown_environment_is_named(capsys: pytest.CaptureFixture[str]) -> Non
     assert "use one of softmode/LiftSoft-v0" in capsys.readouterr().err.replace("Use", "use")
 
 
-@pytest.mark.parametrize("arguments", [[], ["play"], ["dance"], [*PLAY, "--size", "big"], [*PLAY, "--no-such-option"]])
+@pytest.mark.parametrize("arguments", [["play"], ["dance"], [*PLAY, "--size", "big"], [*PLAY, "--no-such-option"]])
 def test_wrong_usage_exits_with_two(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     """The parser's own errors also exit with 2."""
     with pytest.raises(SystemExit) as caught:
@@ -252,18 +254,13 @@ def test_wrong_usage_exits_with_two(arguments: list[str], capsys: pytest.Capture
     assert "Traceback" not in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("module", "arguments"), [("tyro", []), ("imageio_ffmpeg", ["--video", "x.mp4"])])
-def test_missing_extras_name_the_remedy(
-    module: str,
-    arguments: list[str],
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+def test_a_missing_extra_leaves_nothing(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Without an optional package the error says what to install."""
+    """Without an optional package the command ends with code 2, says what to install, and writes nothing."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(sys.modules, module, None)
-    assert main([*PLAY, *arguments]) == 2
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    assert main([*PLAY, "--video", "x.mp4"]) == 2
     assert "pip install 'softmode[demo]'" in capsys.readouterr().err
     assert listing(tmp_path) == []
 
@@ -298,9 +295,17 @@ def test_interrupted_film_leaves_the_old_one(
     assert video.with_suffix(".png").read_bytes() == b"old sheet"
 
 
-def test_installed_command_exits_with_the_code(tmp_path: Path) -> None:
-    """`python -m softmode.cli` hands the exit code to the shell and writes errors to stderr only."""
-    command = [sys.executable, "-m", "softmode.cli.main", *PLAY, "--policy", "clever"]
+def test_the_version_needs_no_package(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """`softmode --version` says it without the packages of the command line."""
+    monkeypatch.setitem(sys.modules, "tyro", None)
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"softmode {softmode.__version__}\n"
+
+
+@pytest.mark.parametrize("module", ["softmode", "softmode.cli", "softmode.cli.main"])
+def test_a_process_exits_with_the_code(module: str, tmp_path: Path) -> None:
+    """`python -m` of each is the command: the exit code reaches the shell, and errors are written to stderr only."""
+    command = [sys.executable, "-m", module, *PLAY, "--policy", "clever"]
     run = subprocess.run(
         command, capture_output=True, text=True, cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)}
     )

@@ -6,7 +6,6 @@ Builds bodies by the command, which is what it tests.
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -177,16 +176,6 @@ def _built(assets: Path, folder: Path, name: str) -> Path:
     """Build an asset and return the file."""
     assert run(assets, "build", name, "-o", str(folder / "built.npz")) == 0
     return folder / "built.npz"
-
-
-def test_show_names_the_extra_that_is_missing(
-    assets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Without matplotlib one line names the extra, and nothing is written."""
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    assert run(assets, "show", "box.obj", "-o", str(tmp_path / "toy.png")) == 2
-    assert "softmode[viz]" in capsys.readouterr().err
-    assert listing(tmp_path) == []
 
 
 def timoshenko(length: float, height: float, modulus: float, density: float, poisson: float) -> float:

@@ -9,15 +9,18 @@ import os
 import re
 import shutil
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import trimesh
 
+from softmode.cli import main as cli
 from softmode.cli.common import finding_line
 from softmode.cli.main import main
 from softmode.cli.object_options import ObjectOptions, stiffer_box
+from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.build.report import Finding
 from softmode.demonstrations import read_dataset
 from softmode.envs.tasks.lift_soft.task import LiftSoftConfig
@@ -25,7 +28,9 @@ from softmode.envs.tasks.place_in_bin.task import PlaceInBinConfig
 from softmode.errors import AssetError, ConfigError
 from softmode.learning.config_values import config_of, joined_config, located_options, pinned_options, values_of
 from softmode.objects import ObjectConfig, load
+from softmode.objects.config import PAINTED, StifferBox
 from softmode.objects.fingerprint import file_fingerprint
+from softmode.objects.paint import StifferColor
 from softmode.splats import make_plush, write_ply
 from tests.test_cli_body import QUICK, merged
 
@@ -81,13 +86,15 @@ def commands(folder: Path) -> dict[str, list[str]]:
 
 
 GIVEN = {
-    "splat": (["--splat", "floater.ply", *UP], "left out: 40 of 1040 splats"),
-    "object": (["--object", "open.obj", "--size", "0.06"], "open mesh: the mesh is not closed"),
+    "splat": (["--splat", "floater.ply", *UP], "left out: 40 of 1040 splats", "--crop"),
+    "object": (["--object", "open.obj", "--size", "0.06"], "open mesh: the mesh is not closed", "fill_holes"),
 }
+LOADING = ("play", "view object", "body check")
+"""One command of each way from the options to a loaded object: by an environment, by a session, for a report."""
+SAID = [(command, "object") for command in commands(Path())] + [(command, "splat") for command in LOADING]
 
 
-@pytest.mark.parametrize("given", GIVEN)
-@pytest.mark.parametrize("command", commands(Path()))
+@pytest.mark.parametrize(("command", "given"), SAID)
 def test_every_command_takes_an_object_and_says_what_matters(
     command: str,
     given: str,
@@ -101,13 +108,22 @@ def test_every_command_takes_an_object_and_says_what_matters(
     extras = {"train": "torch", "evaluate": "torch", "record": "pyarrow", "body show": "matplotlib"}
     pytest.importorskip(extras.get(command, "numpy"))
     monkeypatch.chdir(assets)
-    options, finding = GIVEN[given]
+    options, finding, remedy = GIVEN[given]
     assert main([*commands(tmp_path)[command], *options]) == (1 if command == "body check" else 0)
     out, err = capsys.readouterr()
     said = out if command.startswith("body") else err
     (line,) = [line for line in (out + err).splitlines() if finding in line]
-    assert line in said and "warning: " in line
-    assert ("--crop" if given == "splat" else "fill_holes") in line
+    assert line in said and "warning: " in line and remedy in line
+
+
+def test_check_hands_the_object_on(assets: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The task that is checked has the object of the options."""
+    found: list[dict[str, Any]] = []
+    monkeypatch.setattr("softmode.testing.check_task", lambda env, episodes, **options: found.append(options) or [])
+    file = assets / "open.obj"
+    assert main(["check", ID, "--object", str(file), "--size", "0.06", "--density", "200"]) == 0
+    scene = found[0]["config"].scene
+    assert scene.object.file == ("mesh", file) and (scene.object.size, scene.material.density) == (0.06, 200.0)
 
 
 def test_a_policy_finds_its_object_again(
@@ -165,6 +181,110 @@ def test_a_dataset_says_what_was_recorded(assets: Path, tmp_path: Path, short: N
 
 
 # -- the options ------------------------------------------------------------------------------------------------------
+
+
+EVERYWHERE = (-np.inf,) * 3 + (np.inf,) * 3
+CHOSEN: dict[str, tuple[Any, dict[str, Any]]] = {
+    "splat": (Path("toy.ply"), {"splat": Path("toy.ply")}),
+    "object": (Path("sponge"), {}),
+    "size": (0.07, {"size": 0.07}),
+    "up": ("+z", {"up": "+z"}),
+    "crop": ((0.0, -1.0, 0.0, 1.0, 2.0, 3.0), {"crop": (0.0, -1.0, 0.0, 1.0, 2.0, 3.0)}),
+    "part": ("tallest", {"part": "tallest"}),
+    "pose": ("captured", {"pose": "captured"}),
+    "resolution": (48, {"resolution": 48}),
+    "youngs_modulus": (1e5, {}),
+    "density": (250.0, {}),
+    "friction": (0.7, {}),
+    "stiffness": (
+        ("all=-inf,-inf,-inf,inf,inf,inf,10", "tip=0,0,0,1,1,1,2"),
+        {"stiffness": (StifferBox(box=EVERYWHERE, factor=10.0), StifferBox(box=(0, 0, 0, 1, 1, 1), factor=2.0))},
+    ),
+    "stiffness_by_color": (("#ff0000:4",), {"stiffness_colors": (StifferColor(color=(1.0, 0.0, 0.0), factor=4.0),)}),
+    "stiffness_file": (Path("stiff.npz"), {"stiffness_file": Path("stiff.npz")}),
+    "density_by_color": (("#0000ff:2",), {"density_colors": (StifferColor(color=(0.0, 0.0, 1.0), factor=2.0),)}),
+    "density_file": (Path("dense.npz"), {"density_file": Path("dense.npz")}),
+}
+"""A value of every option, and what it becomes in `ObjectConfig`; a splat file goes before a preset here."""
+
+
+def parsed(words: list[str], monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Return the command of a command line, which is not run."""
+    import tyro
+
+    real, found = tyro.cli, []
+
+    def parse_only(*arguments: Any, **options: Any) -> Any:
+        found.append(real(*arguments, **options))
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(tyro, "cli", parse_only)
+        assert main(words) == 130
+    return found[0]
+
+
+def test_every_command_takes_the_same_options(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every option, without a prefix, of each command that takes an object arrives in its `ObjectOptions`.
+
+    Other commands have no such option: a class with one has the field that takes them all.
+    """
+    assert [field.name for field in dataclasses.fields(ObjectOptions)] == [*CHOSEN]
+    toy, words = ObjectOptions(**{name: value for name, (value, _) in CHOSEN.items()}), []
+    for name, (value, _) in CHOSEN.items():
+        words += [f"--{name.replace('_', '-')}", *map(str, value if isinstance(value, tuple) else (value,))]
+    taking = set()
+    for line in (*commands(tmp_path).values(), ["check", ID], ["body", "cut"]):
+        command = parsed([*line, *words], monkeypatch)
+        assert command.toy == toy
+        taking.add(type(command))
+    alone = {"splat", "object", "youngs_modulus", "density", "friction", *PAINTED}
+    for kind in vars(cli).values():
+        if dataclasses.is_dataclass(kind):
+            names = {field.name for field in dataclasses.fields(kind)}
+            assert ("toy" in names) == (kind in taking) and not names & alone, kind
+
+
+def test_every_option_reaches_the_object() -> None:
+    """Each becomes one field of `ObjectConfig`, those of the material none; the task's own build is kept."""
+    base = ObjectConfig(surface_count=123, build=BuildOptions(mode_count=3), size=0.05)
+    values = {name: value for name, (value, _) in CHOSEN.items() if name != "object"}
+    expected = {name: value for _, fields in CHOSEN.values() for name, value in fields.items()}
+    config = ObjectOptions(**values).object_of(base)
+    assert config == ObjectConfig(surface_count=base.surface_count, build=base.build, **expected)
+    preset = ObjectOptions(object=Path("sponge"), size=0.1).object_of(base)
+    assert preset == ObjectConfig(surface_count=base.surface_count, build=base.build, preset="sponge", size=0.1)
+    assert ObjectOptions(size=0.1).object_of(base) == dataclasses.replace(base, size=0.1)
+    assert ObjectOptions().object_of(base) == base
+
+
+@pytest.mark.parametrize(
+    ("base", "refused"),
+    [
+        (ObjectConfig(splat="toy.ply"), ""),
+        (ObjectConfig(mesh="toy.obj"), "crop part resolution"),
+        (ObjectConfig(preset="sponge"), "crop part resolution"),
+        (ObjectConfig(radiance="toy.nvdb"), "part"),
+        (ObjectConfig(shape="box", extents=(0.1, 0.1, 0.1)), "size up crop part pose resolution"),
+        (
+            ObjectConfig(body="toy.npz"),
+            "size up crop part pose resolution stiffness stiffness_by_color stiffness_file density_by_color "
+            "density_file",
+        ),
+    ],
+    ids=["splats", "mesh", "preset", "field", "shape", "body"],
+)
+def test_options_that_say_nothing_about_an_object_are_refused(base: ObjectConfig, refused: str) -> None:
+    """Which options a kind of object takes, one by one; another is refused by its name."""
+    for name, (value, fields) in CHOSEN.items():
+        if name in ("splat", "object"):
+            continue
+        options = ObjectOptions(**{name: value})
+        if name in refused.split():
+            with pytest.raises(ConfigError, match=f"--{name.replace('_', '-')} given for"):
+                options.object_of(base)
+        else:
+            assert options.object_of(base) == dataclasses.replace(base, **fields)
 
 
 def test_options_become_configurations_and_back(assets: Path) -> None:
@@ -366,16 +486,7 @@ def test_help_fits_a_screen_and_has_an_example(
     assert len(titles) and heights.max() <= SCREEN, heights
     (example,) = [line for line in said if line.startswith("Example: ")]
     assert example.startswith(f"Example: softmode {command}")
-    import tyro
-
-    real, parsed = tyro.cli, []
-
-    def parse_only(*arguments: object, **options: object) -> object:
-        parsed.append(real(*arguments, **options))  # type: ignore[call-overload]
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(tyro, "cli", parse_only)
-    assert main(example.removeprefix("Example: softmode ").split()) == 130 and parsed
+    assert parsed(example.removeprefix("Example: softmode ").split(), monkeypatch)
 
 
 def test_without_arguments_the_first_steps_are_told(capsys: pytest.CaptureFixture[str]) -> None:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -121,13 +119,6 @@ def test_values_are_parsed():
     assert config.scene == dataclasses.replace(PushSoftConfig().scene, substeps=8)
     with pytest.raises(ConfigError, match="colour"):
         config_of(LiftSoftConfig, {"scene": {"object": {"colour": 1}}})
-
-
-def test_the_command_line_stays_light():
-    """Parsing loads no torch."""
-    code = "import sys, softmode.cli.main; print([name for name in ('torch', 'tensorboard') if name in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
 
 
 def test_worlds_in_processes_are_the_same_bits(tmp_path: Path, monkeypatch):

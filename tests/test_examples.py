@@ -36,13 +36,31 @@ IMPORTED = (
 )
 """What nearly all of them import at last: 12 of the 21 s of processor time that an example takes on its own."""
 
+ROOMS = {
+    "deformables": "newton_example",
+    "splats": "deform_splats",
+    "robots": "robot_by_name",
+    "mpm": "morph_topology",
+    "radiance": "radiance_field",
+    "objects": "paint_stiffness",
+    "scenes": "drop_a_splat",
+    "envs": "lift_a_toy",
+    "usd": "usd_in_usd_out",
+    "viz": "rerun_episode",
+    "demonstrations": "record_and_replay",
+    "learning": "behaviour_cloning",
+}
+"""The cheapest example of each room, which every test run plays; the others play with the rest."""
+
 SLOW = {"train_own_toy"}
 """It checks, trains, evaluates and films by four commands, as test_cli_objects.py does one at a time: 80 s."""
 
 
 def test_there_are_examples():
-    """The folder is where this file looks for it, and so are those that it names."""
+    """The folder is where this file looks for it, and so are those that it names; each room's example imports it."""
     assert {path.stem for path in EXAMPLES} >= {*NEEDS, *NEWTONS, *SLOW}
+    for room, name in ROOMS.items():
+        assert re.search(rf"softmode(?:\.| import ){room}\b", (ROOT / "examples" / f"{name}.py").read_text()), name
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
@@ -68,10 +86,13 @@ def server() -> Iterator[ProgramServer]:
         yield started
 
 
+def _marks(name: str) -> list[pytest.MarkDecorator]:
+    """Return what keeps an example out of a short run."""
+    return [pytest.mark.slow] if name in SLOW else [] if name in ROOMS.values() else [pytest.mark.rest]
+
+
 @pytest.mark.parametrize(
-    "path",
-    [pytest.param(path, marks=[pytest.mark.slow] if path.stem in SLOW else []) for path in EXAMPLES],
-    ids=lambda path: path.stem,
+    "path", [pytest.param(path, marks=_marks(path.stem)) for path in EXAMPLES], ids=lambda path: path.stem
 )
 def test_example_runs(path: Path, server: ProgramServer, tmp_path: Path):
     """The short version ends without error; its test_final asserts the physics."""

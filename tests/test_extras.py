@@ -66,6 +66,15 @@ CASES = {
 }
 """What is tried where all of those are missing: the extra that should be named, and the code."""
 
+CORE = """
+import gymnasium, softmode
+env = gymnasium.make("softmode/LiftSoft-v0", obs_type="pixels_agent_pos")
+observation, _ = env.reset(seed=0)
+observation, *_ = env.step(env.action_space.sample())
+assert env.observation_space.contains(observation) and observation["pixels"].std() > 10.0
+"""
+"""What needs none of them: an environment with pictures."""
+
 CHILD = f"""
 import json, sys, traceback
 from importlib.machinery import PathFinder
@@ -100,12 +109,13 @@ def answers(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[str, st
     folder = tmp_path_factory.mktemp("extras")
     write_spz(folder / "toy.spz", make_plush(200), version=4)
     (folder / "toy.usda").write_text("#usda 1.0\n")
-    codes = {name: code for name, (_, code) in CASES.items()}
+    codes = {name: code for name, (_, code) in CASES.items()} | {"core": CORE}
     codes["command line"] = _command_line(codes["command line"])
     done = subprocess.run(
         [sys.executable, "-c", CHILD], input=json.dumps(codes), cwd=folder, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
+    assert {path.name for path in folder.iterdir()} == {"toy.spz", "toy.usda", "a.npz"}, "no case leaves a file"
     return json.loads(done.stdout.splitlines()[-1])
 
 
@@ -124,6 +134,11 @@ def test_missing_package_names_its_extra(answers: dict[str, tuple[str, str]], na
     kind, hint = answers[name]
     assert kind == "MissingExtraError", hint
     assert f"pip install 'softmode[{CASES[name][0]}]'" in hint
+
+
+def test_the_core_needs_none(answers: dict[str, tuple[str, str]]) -> None:
+    """Without any of them an environment is made, reset, stepped and drawn."""
+    assert answers["core"] == ["nothing", ""]
 
 
 def test_hints_name_extras_that_exist() -> None:

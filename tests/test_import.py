@@ -11,6 +11,7 @@ HEAVY = (
     "mujoco",
     "mujoco_warp",
     "torch",
+    "tensorboard",
     "pxr",
     "rerun",
     "viser",

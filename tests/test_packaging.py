@@ -86,12 +86,6 @@ def test_metadata(dist: Path) -> None:
     assert {re.split(r"[^\w-]", line)[0] for line in required if "extra ==" not in line} == CORE
 
 
-def test_command_prints_the_version() -> None:
-    """`softmode --version`, without loading the command line's packages."""
-    done = subprocess.run([sys.executable, "-m", "softmode", "--version"], capture_output=True, text=True, cwd=ROOT)
-    assert done.stdout == f"softmode {softmode.__version__}\n" and done.returncode == 0
-
-
 def test_sdist_builds_the_same_wheel(dist: Path, tmp_path: Path) -> None:
     """The wheel made of the source archive has the same bytes; tests, examples and documentation are in the archive."""
     (archive,) = dist.glob("*.tar.gz")
@@ -106,6 +100,7 @@ def test_sdist_builds_the_same_wheel(dist: Path, tmp_path: Path) -> None:
     assert _contents(first) == _contents(second)
 
 
+@pytest.mark.rest
 def test_wheel_steps_in_an_environment_of_its_own(dist: Path, tmp_path: Path) -> None:
     """Installed with its own requirements and nothing else, it makes an environment with pictures, resets and steps."""
     uv = shutil.which("uv") or str(Path(sys.executable).with_name("uv"))

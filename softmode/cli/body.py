@@ -250,8 +250,8 @@ def _examined(options: _Asset) -> tuple[SoftObject, BodyReport]:
     path = options.path
     toy = options.toy if options.file is None else dataclasses.replace(options.toy, object=path)
     if toy.splat is None and toy.preset is None and file_kind(path) == "body":
-        given = [f.name for f in dataclasses.fields(_Asset) if getattr(options, f.name) != f.default]
-        given = [*(name.replace("_", "-") for name in given if name not in ("file", "toy")), *toy.shape]
+        given = [f.name for f in dataclasses.fields(_Asset)[1:-1] if getattr(options, f.name) != f.default]  # file, toy
+        given = [name.replace("_colors", "_by_color").replace("_", "-") for name in (*given, *toy.shape)]
         if given or isinstance(options, BodyBuild):
             raise ConfigError(
                 f"{path} is a body already{': --' + ', --'.join(given) if given else ''}",

@@ -180,7 +180,7 @@ class ObjectOptions:
     def _refuse(given: Any, what: str, hint: str) -> None:
         """Refuse options that say nothing about an object."""
         if given:
-            names = ", ".join(f"--{name}" for name in given)
+            names = ", ".join(f"--{name.replace('_colors', '_by_color').replace('_', '-')}" for name in given)
             raise ConfigError(f"{names} given for {what}", hint=hint)
 
 

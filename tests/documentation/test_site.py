@@ -39,6 +39,7 @@ def test_formulas_are_understood() -> None:
         assert latex.tex2mathml(formula, as_block=formula in blocks).startswith("<math"), formula
 
 
+@pytest.mark.sphinx
 def test_the_site_builds(tmp_path: Path) -> None:
     """`make docs`: no warning, a page per source, formulas as MathML, and no script or style from elsewhere."""
     for module in ("sphinx", "furo", "myst_parser"):

@@ -15,25 +15,26 @@ from tests.documentation.setups import SETUPS
 
 WITH_PYTHON = [page for page in PAGES if any(fence.mark != "not run" for fence in fences(page, "python"))]
 
+DEAR = {
+    *("docs/objects.md", "docs/usd.md", "docs/view.md", "docs/bodies.md", "docs/rerun.md", "docs/radiance.md"),
+    *("docs/cutting.md", "docs/robots.md", "docs/howto/own_splat.md", "docs/howto/own_robot.md"),
+    "docs/howto/own_env.md",
+}
+"""Pages of 6 s and more, whose snippets show at length what tests of their rooms show; they run with the rest."""
+
 
 def _name(page: Path) -> str:
     """Return the path of a page below the checkout."""
     return page.relative_to(ROOT).as_posix()
 
 
-def _cases() -> list[Any]:
-    """Return the pages; those with a slow snippet are marked."""
-    return [
-        pytest.param(
-            page,
-            id=_name(page),
-            marks=[pytest.mark.slow] if any(fence.mark == "slow" for fence in fences(page, "python")) else [],
-        )
-        for page in WITH_PYTHON
-    ]
+def _marks(page: Path) -> list[pytest.MarkDecorator]:
+    """Return what keeps a page out of a short run: a slow snippet, or that it is dear."""
+    slow = any(fence.mark == "slow" for fence in fences(page, "python"))
+    return [pytest.mark.slow] if slow else [pytest.mark.rest] if _name(page) in DEAR else []
 
 
-@pytest.mark.parametrize("page", _cases())
+@pytest.mark.parametrize("page", [pytest.param(page, id=_name(page), marks=_marks(page)) for page in WITH_PYTHON])
 def test_a_page_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its snippets run one after the other, and what the text says of them holds."""
     monkeypatch.chdir(tmp_path)
@@ -48,8 +49,8 @@ def test_a_page_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 
 def test_set_ups_and_results_have_pages() -> None:
-    """No set-up and no result is left of a page that is gone or no longer runs."""
-    assert {_name(page) for page in WITH_PYTHON} >= {*SETUPS, *RESULTS}
+    """No set-up, result or mark is left of a page that is gone or no longer runs."""
+    assert {_name(page) for page in WITH_PYTHON} >= {*SETUPS, *RESULTS, *DEAR}
 
 
 def test_every_fence_names_its_language() -> None:

@@ -21,7 +21,11 @@ from tests.needs import needs
 from tests.view.serving import Served, served
 
 CHROMIUM = os.environ.get("CHROMIUM") or shutil.which("chromium") or shutil.which("google-chrome")
-pytestmark = [needs("viser", "playwright"), pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed")]
+pytestmark = [
+    needs("viser", "playwright"),
+    pytest.mark.browser,
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed"),
+]
 FLAGS = (
     "--headless=new --no-sandbox --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader "
     "--disable-background-networking --disable-component-update --disable-sync --no-first-run"

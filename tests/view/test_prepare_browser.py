@@ -24,7 +24,11 @@ from tests.needs import needs
 from tests.view.page_client import PageClient
 from tests.view.test_browser import CHROMIUM, FLAGS, until
 
-pytestmark = [needs("viser", "playwright"), pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed")]
+pytestmark = [
+    needs("viser", "playwright"),
+    pytest.mark.browser,
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed"),
+]
 SIZE = (1100, 480)
 """Width and height of the page [px]; the panel lies beside the gizmos."""
 ARROW = 0.22
