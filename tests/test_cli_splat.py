@@ -80,6 +80,18 @@ def test_convert_keeps_the_splats(kind: str, tmp_path: Path, capsys: pytest.Capt
     assert np.abs(read_splats(target).means[:, 1] + read.means[:, 2]).max() < 2.0**-11
 
 
+def test_convert_knows_what_is_up_in_the_file_it_reads(tmp_path: Path) -> None:
+    """Of OpenUSD to .ply it is z, of .ply to OpenUSD -y, unless told."""
+    pytest.importorskip("pxr", reason="the extra usd is not installed")
+    plush, stage, file = make_plush(count=200), tmp_path / "a.usda", tmp_path / "b.ply"
+    write_splats(stage, plush)
+    assert main(["splat", "convert", str(stage), str(file), "--convention", "z-up"]) == 0
+    np.testing.assert_allclose(read_splats(file).means, plush.means, atol=1e-6)
+    write_splats(file, plush, up="-y")
+    assert main(["splat", "convert", str(file), str(stage), "--convention", "z-up"]) == 0
+    np.testing.assert_allclose(read_splats(stage).means, plush.means, atol=1e-6)
+
+
 FAILURES: dict[str, tuple[list[str], str]] = {
     "missing mesh": (["from-mesh", "{folder}/none.glb"], "none.glb"),
     "no mesh": (["from-mesh", "{folder}/text.glb"], "text.glb"),

@@ -18,6 +18,7 @@ from softmode.scenes.motion import coordinates
 from softmode.splats.formats import write_splats
 from softmode.view.live_recording import LiveRecording
 from softmode.view.live_types import LiveOptions
+from softmode.view.pace import Pace
 from softmode.view.session import LiveSession
 from tests.scenes import rotation
 
@@ -89,6 +90,16 @@ def side(live):
 
 
 # -- time -------------------------------------------------------------------------------------------------------------
+
+
+def test_time_that_did_not_fit_is_lost():
+    """After a frame in which two blocks of ten fitted, a fast one owes its own block and the one begun, not eight."""
+    pace = Pace(block_dt=0.01, budget=0.5)
+    pace.took(0.025)
+    assert pace.blocks(0.1) == 2
+    pace.frame(0.0, 0.02)
+    pace.block_seconds = 1e-6
+    assert pace.blocks(0.01) == 2
 
 
 def test_time_passes_as_told():
