@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import norm
+from scipy.special import log_ndtr
 
 from softmode.deformables.build.cut import Cut, cut_body
 from softmode.deformables.build.patch import Patch
@@ -104,7 +104,7 @@ def split_splats(splats: Splats, level: Array, normal: Array) -> Splats:
     chosen, C, along, s = splats.subset(rows), C[rows], along[rows] / s[rows, None], s[rows]
     for side in (1.0, -1.0):
         z = side * level[rows] / s
-        shift = np.exp(norm.logpdf(z) - norm.logcdf(z))
+        shift = np.exp(-(z**2) / 2.0 - np.log(np.sqrt(2.0 * np.pi)) - log_ndtr(z))
         variance = 1.0 - z * shift - shift**2
         means = chosen.means.astype(np.float64) + side * shift[:, None] * along
         kept = C - (1.0 - variance)[:, None, None] * along[:, :, None] * along[:, None]

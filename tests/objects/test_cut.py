@@ -7,7 +7,6 @@ import dataclasses
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.stats import norm
 
 from softmode.deformables import BuildOptions, Material, Patch
 from softmode.objects import ObjectConfig, Placed, SoftObject, cut_object, load, write_object
@@ -34,6 +33,8 @@ def world_splats(parts: tuple[SoftObject, ...]) -> NDArray[np.float64]:
 
 def test_a_split_gaussian_keeps_mass_mean_and_covariance() -> None:
     """The two halves of a Gaussian, weighed by its mass on either side, have its mean and its covariance."""
+    from scipy.stats import norm
+
     rng = np.random.default_rng(0)
     factor = rng.normal(size=(50, 3, 3))
     one = Splats(
