@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import fcntl
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -23,13 +22,13 @@ def compile_once() -> None:
 
     Each module has a lock of its own, a file beside Warp's cache: the threads of all processes share a list of modules
     among them instead of compiling it as often as there are processes. Modules of Newton are compiled without adjoints,
-    as environments do, or both kinds would be.
+    whenever they are imported, as environments do, or both kinds would be.
     """
     import warp as wp
 
     for name in WITHOUT_ADJOINTS:
-        if name in sys.modules and not wp.get_module(name).execs:
-            wp.set_module_options({"enable_backward": False}, module=sys.modules[name])
+        if not wp.get_module(name).execs:
+            wp.set_module_options({"enable_backward": False}, module=name)
 
     compile_alone = wp.Module._compile
 
