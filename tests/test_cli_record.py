@@ -16,8 +16,10 @@ import pytest
 from softmode import ENVIRONMENTS
 from softmode.cli.main import main
 from softmode.demonstrations import read_dataset
+from tests.needs import needs
 
-pytest.importorskip("pyarrow")
+pytestmark = needs("pyarrow")
+
 
 ID = "softmode/LiftSoft-v0"
 os.environ.setdefault("SOFTMODE_CACHE", str(Path(__file__).resolve().parents[1] / ".cache" / "softmode"))

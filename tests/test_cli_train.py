@@ -11,12 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("torch")
-
 from softmode.cli import main as cli
 from softmode.cli.train import Train, parse_env_options, parse_overrides
 from softmode.errors import ConfigError
 from softmode.learning.config_values import config_of
+from tests.needs import needs
+
+pytestmark = needs("torch")
 
 QUICK = ["--num-envs", "2", "--total-steps", "128", "--set", "rollout_steps=32", "hidden=[8]", "--eval-episodes"]
 

@@ -1,6 +1,5 @@
 """Two-way contact with MuJoCo: derivatives of the joint potential, momentum, squeeze force, batching, faults."""
 
-import mujoco_warp
 import newton
 import numpy as np
 import pytest
@@ -556,6 +555,8 @@ def test_options_reach_the_soft_solve():
 
 def test_private_names_of_the_rigid_solver_are_checked(monkeypatch):
     """A rigid solver without them gets a warning when the solver is built, and whole steps: the same step to 1e-5."""
+    import mujoco_warp
+
     scene, _ = impact(1.0)
     while np.abs(scene.reduced.instance_force.numpy()).max() < 1.0:
         scene.step()

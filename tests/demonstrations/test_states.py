@@ -10,8 +10,9 @@ import pytest
 
 from softmode.demonstrations import DatasetWriter, environment_features, read_dataset, record_episodes
 from softmode.errors import ConfigError, StateError
+from tests.needs import needs
 
-pytest.importorskip("pyarrow")
+pytestmark = needs("pyarrow")
 
 
 def test_an_episode_begins_again_where_it_began(tmp_path: Path) -> None:

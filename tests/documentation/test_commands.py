@@ -14,8 +14,9 @@ from typing import Any
 import pytest
 
 from tests.documentation.pages import PAGES, ROOT, command_lines, prose
+from tests.needs import needs
 
-pytest.importorskip("tyro", reason="needs the extra [demo]")
+pytestmark = needs("tyro")
 
 
 @pytest.fixture

@@ -15,8 +15,9 @@ import softmode  # noqa: F401  (registers the environments)
 from softmode.envs.adapters.common import infos_of_worlds
 from softmode.errors import ConfigError
 from tests.envs.walks import GoalWalkVectorEnv, WalkVectorEnv
+from tests.needs import needs
 
-torch = pytest.importorskip("torch")
+pytestmark = needs("torch")
 
 LIMIT = 20
 """Control steps of an episode."""
@@ -55,6 +56,8 @@ def pixels() -> Iterator[Any]:
 
 def changed(before: dict[str, Any], after: dict[str, Any]) -> bool:
     """Whether every parameter is finite and most of them moved."""
+    import torch
+
     assert all(torch.isfinite(value).all() for value in after.values())
     moved = [not torch.equal(before[name], after[name]) for name in before]
     return sum(moved) > len(moved) / 2
@@ -186,6 +189,8 @@ def test_stable_baselines_trains(lift: Any, tmp_path: Path) -> None:
 
 def test_stable_baselines_relabels_goals() -> None:
     """Hindsight experience replay asks a goal environment's `compute_reward` through the adapter, and learns."""
+    import torch
+
     pytest.importorskip("stable_baselines3")
     from stable_baselines3 import DDPG, HerReplayBuffer
 
@@ -226,6 +231,8 @@ RSL = {
 
 def test_rsl_rl_trains(lift: Any, tmp_path: Path) -> None:
     """The on-policy runner takes 4 x 25 steps of 2 worlds, logs reward terms and successes, and saves its policy."""
+    import torch
+
     pytest.importorskip("rsl_rl")
     from rsl_rl.runners import OnPolicyRunner
 
@@ -245,6 +252,8 @@ def test_rsl_rl_trains(lift: Any, tmp_path: Path) -> None:
 
 def test_rsl_rl_counts_steps(lift: Any) -> None:
     """Setting `episode_length_buf` moves the ends of the episodes: a world one step before the limit is cut next."""
+    import torch
+
     pytest.importorskip("rsl_rl")
     from softmode.envs.adapters import RslRlVecEnv
 
@@ -262,6 +271,8 @@ def test_rsl_rl_counts_steps(lift: Any) -> None:
 
 def test_rsl_rl_groups_pictures(pixels: Any) -> None:
     """Pictures become channels-first floats in 0..1; the critic sees the state that the policy does not."""
+    import torch
+
     pytest.importorskip("rsl_rl")
     from softmode.envs.adapters import RslRlVecEnv
 
@@ -281,6 +292,8 @@ def test_rsl_rl_groups_pictures(pixels: Any) -> None:
 
 def test_skrl_trains(lift: Any, tmp_path: Path) -> None:
     """PPO of skrl takes 100 steps of 2 worlds with its sequential trainer."""
+    import torch
+
     pytest.importorskip("skrl")
     from skrl.agents.torch.ppo import PPO, PPO_CFG
     from skrl.memories.torch import RandomMemory
@@ -313,6 +326,8 @@ def test_skrl_trains(lift: Any, tmp_path: Path) -> None:
 
 def test_skrl_shapes(pixels: Any) -> None:
     """Observations are flat, flags are columns, reset starts episodes once, and pictures come with a state."""
+    import torch
+
     pytest.importorskip("skrl")
     from skrl.utils.spaces.torch import unflatten_tensorized_space
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
-import torch
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
+
+if TYPE_CHECKING:
+    import torch
 
 
 class PointVectorEnv(gym.vector.VectorEnv):
@@ -40,6 +42,8 @@ class PointVectorEnv(gym.vector.VectorEnv):
         device: str = "cpu",
     ) -> None:
         """Allocate the worlds."""
+        import torch
+
         self.num_envs, self.obs_type, self.mode, self.max_episode_steps = num_envs, obs_type, mode, limit
         self.metadata = {"autoreset_mode": mode}
         self.nan_at, self.reward_nan, self.device = nan_at, reward_nan, torch.device(device)
@@ -64,10 +68,14 @@ class PointVectorEnv(gym.vector.VectorEnv):
     @property
     def state_observation(self) -> torch.Tensor:
         """Position and goal, (n, 4)."""
+        import torch
+
         return torch.cat([self.place, self.goal], dim=1)
 
     def _start(self, mask: torch.Tensor) -> None:
         """Begin the next episode of the worlds of a mask."""
+        import torch
+
         phase = ((self.seeds % 10007).double() * 12.9898 + self.episode.double() * 78.233)[:, None]
         phase = phase * self.frequencies
         draw = (2.0 * torch.remainder(torch.sin(phase) * 43758.5, 1.0) - 1.0).float()
@@ -79,6 +87,8 @@ class PointVectorEnv(gym.vector.VectorEnv):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start episodes."""
+        import torch
+
         mask = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         if options and "reset_mask" in options:
             mask = torch.as_tensor(options["reset_mask"], device=self.device)
@@ -89,6 +99,8 @@ class PointVectorEnv(gym.vector.VectorEnv):
         return self._observe(), {}
 
     def _observe(self) -> Any:
+        import torch
+
         if self.obs_type == "state":
             return self.state_observation.clone()
         grid = torch.linspace(-2.0, 2.0, self.SIZE, device=self.device)
@@ -102,6 +114,8 @@ class PointVectorEnv(gym.vector.VectorEnv):
 
     def step(self, actions: torch.Tensor) -> tuple[Any, torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:
         """Move the points."""
+        import torch
+
         assert isinstance(actions, torch.Tensor) and actions.shape == (self.num_envs, 2)
         waiting = self.done.clone() if self.mode == AutoresetMode.NEXT_STEP else torch.zeros_like(self.done)
         self.place = self.place + torch.where(waiting[:, None], 0.0, 0.2 * actions.clamp(-1.0, 1.0))

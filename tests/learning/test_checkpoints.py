@@ -14,22 +14,23 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-pytest.importorskip("torch")
-
-import torch
-
 from softmode.errors import CheckpointError, ConfigError
 from softmode.learning.checkpoints import Checkpoint, check_env, read_checkpoint, write_checkpoint
 from softmode.learning.hyperparameters import Hyperparameters
-from softmode.learning.networks import ActorCritic
-from softmode.learning.policy import load_policy
 from softmode.learning.spaces import Interface
+from tests.needs import needs
+
+pytestmark = needs("torch")
 
 INTERFACE = Interface(vectors={"state": 3}, pictures={}, action_low=(-2.0,), action_high=(2.0,))
 
 
 def checkpoint(interface: Interface = INTERFACE, **changes) -> Checkpoint:
     """Return a checkpoint of an untrained network."""
+    import torch
+
+    from softmode.learning.networks import ActorCritic
+
     options = Hyperparameters(hidden=(4,), features=8)
     torch.manual_seed(0)
     model = ActorCritic(interface, 0, options)
@@ -108,6 +109,10 @@ class Bomb:
 
 def test_no_pickle_is_run(tmp_path: Path):
     """A pickle, a torch file and an .npz of objects are refused, and what they would do does not happen."""
+    import torch
+
+    from softmode.learning.policy import load_policy
+
     Bomb.path = tmp_path / "harm"
     (tmp_path / "a.npz").write_bytes(pickle.dumps(Bomb()))
     torch.save({"x": Bomb()}, tmp_path / "b.npz")
@@ -122,6 +127,8 @@ def test_no_pickle_is_run(tmp_path: Path):
 
 def test_foreign_files_are_refused(tmp_path: Path):
     """Missing, empty, text, a folder, an archive of something else."""
+    from softmode.learning.policy import load_policy
+
     (tmp_path / "empty.npz").touch()
     (tmp_path / "text.npz").write_text("not a zip")
     (tmp_path / "folder.npz").mkdir()
@@ -194,6 +201,8 @@ def _env(header, arrays):
 )
 def test_contradictions_are_refused(path: Path, change):
     """Another version, missing arrays, other shapes and types, numbers that are not finite, a header that lies."""
+    from softmode.learning.policy import load_policy
+
     rewrite(path, change)
     with pytest.raises(CheckpointError) as caught:
         load_policy(path)
@@ -202,6 +211,8 @@ def test_contradictions_are_refused(path: Path, change):
 
 def test_another_environment_is_refused(path: Path):
     """By its id, by its spaces."""
+    from softmode.learning.policy import load_policy
+
     policy = load_policy(path)
     policy.check(gym.make("Pendulum-v1"))
     with pytest.raises(CheckpointError, match="MountainCarContinuous-v0"):

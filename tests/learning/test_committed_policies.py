@@ -6,10 +6,9 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("torch")
+from tests.needs import needs
 
-from softmode.learning.environments import make_vector_env
-from softmode.learning.policy import evaluate, load_policy
+pytestmark = needs("torch")
 
 FOLDER = Path(__file__).parents[2] / "policies"
 LEAST = {"lift_soft": (18, 20), "press_soft": (17, 20), "push_soft": (15, 20), "lift_soft_pixels": (8, 10)}
@@ -26,12 +25,16 @@ def test_all_are_tested():
 @pytest.mark.parametrize("name", LEAST)
 def test_loads(name: str):
     """Each holds a policy and nothing that only training needs."""
+    from softmode.learning.policy import load_policy
+
     policy = load_policy(FOLDER / f"{name}.npz")
     assert policy.env.startswith("softmode/") and all(key.startswith("actor.") for key in policy.checkpoint.arrays)
 
 
 def test_lifts():
     """An episode of LiftSoft."""
+    from softmode.learning.policy import evaluate, load_policy
+
     policy = load_policy(FOLDER / "lift_soft.npz")
     env = policy.make()
     try:
@@ -45,6 +48,9 @@ def test_lifts():
 @pytest.mark.parametrize("name", LEAST)
 def test_success(name: str):
     """Episodes with random stiffness and pose end in success."""
+    from softmode.learning.environments import make_vector_env
+    from softmode.learning.policy import evaluate, load_policy
+
     least, episodes = LEAST[name]
     policy = load_policy(FOLDER / f"{name}.npz")
     env = make_vector_env(policy.env, 2, "cpu", policy.env_options)

@@ -7,20 +7,18 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pytest
 
-pytest.importorskip("torch")
-
-import torch
-
-from softmode.learning.distributed import Ranks
 from softmode.learning.hyperparameters import Hyperparameters
-from softmode.learning.networks import ActorCritic
-from softmode.learning.ppo import PPO
-from softmode.learning.rollout import Rollout
 from softmode.learning.spaces import Interface
+from tests.needs import needs
+
+if TYPE_CHECKING:
+    from softmode.learning.distributed import Ranks
+
+pytestmark = needs("torch")
 
 ROOT = Path(__file__).resolve().parents[2]
 TRAIN = """
@@ -76,6 +74,12 @@ def torchrun(code: str, folder: Path, processes: int = 2) -> None:
 
 def updated(ranks: Ranks) -> np.ndarray:
     """Return the parameters after one update with this rank's share of a rollout of eight worlds."""
+    import torch
+
+    from softmode.learning.networks import ActorCritic
+    from softmode.learning.ppo import PPO
+    from softmode.learning.rollout import Rollout
+
     interface = Interface(vectors={"state": 3}, pictures={}, action_low=(-1.0, -1.0), action_high=(1.0, 1.0))
     options = Hyperparameters(hidden=(8,), epochs=1, minibatches=1)
     torch.manual_seed(0)
@@ -116,6 +120,8 @@ def test_two_processes_stay_equal(tmp_path: Path):
 
 def test_two_processes_update_as_one_with_all_worlds(tmp_path: Path):
     """One update of two halves equals that of the whole up to rounding: scales, advantages, gradients, divergence."""
+    from softmode.learning.distributed import Ranks
+
     torchrun(UPDATE, tmp_path)
     first, second = (np.load(tmp_path / f"rank{rank}.npy") for rank in range(2))
     assert np.array_equal(first, second)

@@ -8,21 +8,23 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-
-pytest.importorskip("torch")
-
-import torch
 from gymnasium.vector import AutoresetMode
 
 from softmode.errors import CheckpointError, ConfigError
 from softmode.learning.checkpoints import write_checkpoint
-from softmode.learning.policy import Evaluation, evaluate, load_policy
 from softmode.learning.spaces import Interface
 from tests.learning.test_checkpoints import checkpoint
+from tests.needs import needs
+
+pytestmark = needs("torch")
 
 
 def test_one_or_many_observations_arrays_or_tensors(tmp_path: Path):
     """The action comes in the kind and the range of the environment, and a batch is its rows."""
+    import torch
+
+    from softmode.learning.policy import load_policy
+
     write_checkpoint(checkpoint(), tmp_path / "p.npz")
     policy = load_policy(tmp_path / "p.npz")
     batch = np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32)
@@ -38,6 +40,8 @@ def test_one_or_many_observations_arrays_or_tensors(tmp_path: Path):
 
 def test_a_checkpoint_imports_no_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """An environment of a module that nobody has imported is refused, and the module is not run."""
+    from softmode.learning.policy import load_policy
+
     (tmp_path / "stranger.py").write_text("raise SystemExit('this has run')")
     monkeypatch.syspath_prepend(tmp_path)
     write_checkpoint(checkpoint(env="stranger:Pendulum-v1"), tmp_path / "p.npz")
@@ -51,6 +55,8 @@ def test_a_checkpoint_imports_no_module(tmp_path: Path, monkeypatch: pytest.Monk
 def test_pictures_and_vectors(tmp_path: Path, encoder: str):
     """A Dict observation goes through both encoders; each part changes the action."""
     import dataclasses
+
+    from softmode.learning.policy import load_policy
 
     interface = Interface(
         vectors={"agent_pos": 2}, pictures={"pixels": (64, 64, 3)}, action_low=(-1.0, -1.0), action_high=(1.0, 1.0)
@@ -100,6 +106,8 @@ class Lottery(gym.Env):
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
 def test_evaluation_does_not_prefer_short_episodes(mode: AutoresetMode):
     """The rate is that of the first episodes of every world; the first episodes to end would give far less."""
+    from softmode.learning.policy import evaluate
+
     worlds, episodes = 20, 50
     env = gym.vector.SyncVectorEnv([Lottery] * worlds, autoreset_mode=mode)
 
@@ -122,6 +130,8 @@ def test_evaluation_does_not_prefer_short_episodes(mode: AutoresetMode):
 
 def test_a_single_environment_is_evaluated():
     """Episode k has seed s + k."""
+    from softmode.learning.policy import evaluate
+
     found = evaluate(Lottery(), lambda observation: np.zeros(1, np.float32), 30, seed=7)
     wins = []
     for k in range(30):
@@ -135,6 +145,8 @@ def test_a_single_environment_is_evaluated():
 
 def test_the_interval_is_wilsons():
     """Wilson's interval of 180 successes in 200 is 85.1 to 93.4 %; of none in 10 it ends at 27.8 %."""
+    from softmode.learning.policy import Evaluation
+
     fields = {"mean_return": 0.0, "std_return": 0.0, "mean_length": 1.0}
     low, high = Evaluation(episodes=200, success_rate=0.9, **fields).interval()
     assert (round(low, 3), round(high, 3)) == (0.851, 0.934)

@@ -4,21 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
-pytest.importorskip("torch")
-
-import torch
 from gymnasium.vector import AutoresetMode
 
 from softmode.errors import ConfigError
-from softmode.learning import ppo as module
-from softmode.learning.distributed import Ranks
 from softmode.learning.hyperparameters import Hyperparameters, preset
-from softmode.learning.moments import RunningMoments
-from softmode.learning.optimizer import FlatAdam
 from softmode.learning.train_options import TrainOptions
-from softmode.learning.trainer import train
 from tests.learning.point_env import PointVectorEnv
+from tests.needs import needs
+
+pytestmark = needs("torch")
 
 FAST = Hyperparameters(
     rollout_steps=16, epochs=4, minibatches=4, discount=0.9, hidden=(64, 64), learning_rate=2e-3, desired_kl=0.02
@@ -27,6 +21,8 @@ FAST = Hyperparameters(
 
 def run(tmp_path, steps, *, worlds=64, options=FAST, mode=AutoresetMode.NEXT_STEP, seed=0, **kwargs):
     """Train on the point environment; return the result."""
+    from softmode.learning.trainer import train
+
     obs_type = kwargs.pop("obs_type", "state")
     return train(
         TrainOptions(
@@ -93,6 +89,10 @@ def test_the_same_seed_gives_the_same_bits(tmp_path):
 
 def test_adam_is_adam():
     """Steps on the flat buffer equal those of torch's Adam with clipped gradients."""
+    import torch
+
+    from softmode.learning.optimizer import FlatAdam
+
     torch.manual_seed(0)
     ours = torch.nn.Sequential(torch.nn.Linear(4, 8), torch.nn.Tanh(), torch.nn.Linear(8, 2))
     theirs = torch.nn.Sequential(torch.nn.Linear(4, 8), torch.nn.Tanh(), torch.nn.Linear(8, 2))
@@ -114,6 +114,10 @@ def test_adam_is_adam():
 
 def test_a_gradient_that_is_not_finite_changes_nothing():
     """Parameters and moments keep their bits, and the step is counted as skipped."""
+    import torch
+
+    from softmode.learning.optimizer import FlatAdam
+
     layer = torch.nn.Linear(3, 3)
     flat = FlatAdam(layer.parameters(), 1e-2, 1.0)
     layer(torch.ones(1, 3)).sum().backward()
@@ -128,6 +132,10 @@ def test_a_gradient_that_is_not_finite_changes_nothing():
 
 def test_learning_rate_follows_the_divergence():
     """It falls above twice the desired divergence, rises below half of it, and stays in its bounds."""
+    import torch
+
+    from softmode.learning.optimizer import FlatAdam
+
     flat = FlatAdam(torch.nn.Linear(1, 1).parameters(), 1e-3, 1.0)
     for divergence, expected in ((0.03, 1e-3 / 1.5), (0.015, 1e-3 / 1.5), (0.001, 1e-3), (0.0, 1e-3)):
         flat.adapt(torch.tensor(divergence), 0.01, (1e-5, 5e-3))
@@ -139,6 +147,10 @@ def test_learning_rate_follows_the_divergence():
 
 def test_densities_are_those_of_a_gaussian():
     """Log density and divergence equal torch.distributions'."""
+    import torch
+
+    from softmode.learning import ppo as module
+
     generator = torch.Generator().manual_seed(0)
     sample, mean, other = (torch.randn(7, 3, generator=generator) for _ in range(3))
     log_std, other_log_std = torch.tensor([-1.0, 0.0, 0.3]), torch.tensor([-0.5, 0.2, 0.1])
@@ -151,6 +163,11 @@ def test_densities_are_those_of_a_gaussian():
 
 def test_moments_are_those_of_all_samples():
     """Merged batches give the mean and the variance of their union; samples of weight 0 do not count."""
+    import torch
+
+    from softmode.learning.distributed import Ranks
+    from softmode.learning.moments import RunningMoments
+
     rng = np.random.default_rng(0)
     moments = RunningMoments((3,))
     seen = []

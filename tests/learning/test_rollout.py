@@ -2,28 +2,38 @@
 
 from __future__ import annotations
 
-import numpy as np
-import pytest
-
-pytest.importorskip("torch")
+from typing import TYPE_CHECKING
 
 import gymnasium as gym
-import torch
+import numpy as np
+import pytest
 from gymnasium.vector import AutoresetMode
 
-from softmode.learning.distributed import Ranks
 from softmode.learning.hyperparameters import Hyperparameters
-from softmode.learning.networks import ActorCritic
-from softmode.learning.ppo import PPO
-from softmode.learning.rollout import Collector, generalized_advantage
-from softmode.learning.vector_tensors import TensorVectorEnv
 from tests.learning.point_env import PointVectorEnv
+from tests.needs import needs
+
+if TYPE_CHECKING:
+    import torch
+
+    from softmode.learning.ppo import PPO
+    from softmode.learning.rollout import Collector
+
+pytestmark = needs("torch")
 
 OPTIONS = Hyperparameters(rollout_steps=40, hidden=(16,), scale_rewards=False, normalize_observations=False)
 
 
 def collector(env: gym.vector.VectorEnv, options: Hyperparameters = OPTIONS) -> tuple[Collector, PPO]:
     """Return a collector and a learner with networks of seed 0."""
+    import torch
+
+    from softmode.learning.distributed import Ranks
+    from softmode.learning.networks import ActorCritic
+    from softmode.learning.ppo import PPO
+    from softmode.learning.rollout import Collector
+    from softmode.learning.vector_tensors import TensorVectorEnv
+
     worlds = TensorVectorEnv(env, torch.device("cpu"))
     first = worlds.reset(5)
     torch.manual_seed(0)
@@ -33,6 +43,10 @@ def collector(env: gym.vector.VectorEnv, options: Hyperparameters = OPTIONS) -> 
 
 def test_advantage_is_the_sum_of_discounted_errors():
     """A_t = sum_k (gamma lambda)^k delta_(t+k), up to the end of the episode."""
+    import torch
+
+    from softmode.learning.rollout import generalized_advantage
+
     rng = np.random.default_rng(0)
     steps, n, gamma, decay = 20, 3, 0.9, 0.8
     reward, value, following = (rng.normal(size=(steps, n)) for _ in range(3))
@@ -53,25 +67,28 @@ def test_advantage_is_the_sum_of_discounted_errors():
 
 def actions(step: torch.Tensor, worlds: int) -> torch.Tensor:
     """Return actions that depend on the step of the episode alone, some of which leave the square."""
+    import torch
+
     angle = 0.7 * torch.arange(worlds)
     out = torch.stack([torch.cos(angle), torch.sin(angle)], dim=1)
     return out * (1.0 - 0.05 * step[:, None])
 
 
-class Scripted(torch.nn.Module):
-    """Stands for the perceptron of the actor: actions by the age of the episodes."""
-
-    def __init__(self, env: PointVectorEnv) -> None:
-        super().__init__()
-        self.env = env
-
-    def forward(self, encoding: torch.Tensor) -> torch.Tensor:
-        """Return the means of the actions."""
-        return actions(self.env.age, self.env.num_envs)
-
-
 def test_both_autoreset_modes_give_the_same_advantages():
     """The transitions of an episode do not depend on when the next one begins: neither do their advantages."""
+    import torch
+
+    class Scripted(torch.nn.Module):
+        """Stands for the perceptron of the actor: actions by the age of the episodes."""
+
+        def __init__(self, env: PointVectorEnv) -> None:
+            super().__init__()
+            self.env = env
+
+        def forward(self, encoding: torch.Tensor) -> torch.Tensor:
+            """Return the means of the actions."""
+            return actions(self.env.age, self.env.num_envs)
+
     tables = []
     for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP):
         env = PointVectorEnv(6, mode=mode)
@@ -98,6 +115,8 @@ def test_both_autoreset_modes_give_the_same_advantages():
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
 def test_truncation_bootstraps_from_the_last_state(mode: AutoresetMode):
     """At a truncation A = r + gamma V(s') - V(s) with the value of the episode's own last state."""
+    import torch
+
     env = PointVectorEnv(4, mode=mode)
     collect, ppo = collector(env)
     rollout = collect.collect(torch.Generator())
@@ -113,6 +132,8 @@ def test_truncation_bootstraps_from_the_last_state(mode: AutoresetMode):
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
 def test_gymnasium_environments_bootstrap_too(mode: AutoresetMode):
     """Arrays with None where an episode goes on are read: truncations get the value of the pendulum's last state."""
+    import torch
+
     env = gym.make_vec(
         "Pendulum-v1", 3, vectorization_mode="sync", vector_kwargs={"autoreset_mode": mode}, max_episode_steps=9
     )
@@ -132,6 +153,8 @@ def test_gymnasium_environments_bootstrap_too(mode: AutoresetMode):
 
 def test_statistics_count_whole_episodes():
     """Sums of returns, lengths and successes equal those of a loop over worlds; reset steps do not count."""
+    import torch
+
     env = PointVectorEnv(5)
     collect, _ = collector(env)
     rollout = collect.collect(torch.Generator().manual_seed(0))
@@ -155,6 +178,8 @@ def test_statistics_count_whole_episodes():
 
 def test_stagger_spreads_the_ages():
     """After `limit` steps of staggering the worlds are at all ages, evenly."""
+    import torch
+
     limit = 40
     env = PointVectorEnv(80, limit=limit)
     collect, ppo = collector(env)
@@ -168,6 +193,12 @@ def test_stagger_spreads_the_ages():
 @pytest.mark.gpu
 def test_a_rollout_reads_nothing_back():
     """No step of a rollout waits for the device."""
+    import torch
+
+    from softmode.learning.networks import ActorCritic
+    from softmode.learning.rollout import Collector
+    from softmode.learning.vector_tensors import TensorVectorEnv
+
     if not torch.cuda.is_available():
         pytest.skip("needs a CUDA device")
     worlds = TensorVectorEnv(PointVectorEnv(64, device="cuda"), torch.device("cuda"))

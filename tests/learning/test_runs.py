@@ -13,17 +13,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("torch")
-
-import torch
-
 from softmode.errors import CheckpointError, ConfigError, RunError, TrainingDiverged
 from softmode.learning.checkpoints import read_checkpoint
 from softmode.learning.hyperparameters import Hyperparameters
-from softmode.learning.policy import load_policy
 from softmode.learning.train_options import TrainOptions
-from softmode.learning.trainer import train
 from tests.learning.point_env import PointVectorEnv
+from tests.needs import needs
+
+pytestmark = needs("torch")
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = Hyperparameters(rollout_steps=8, epochs=2, minibatches=2, hidden=(16,), discount=0.9)
@@ -31,6 +28,8 @@ SMALL = Hyperparameters(rollout_steps=8, epochs=2, minibatches=2, hidden=(16,), 
 
 def run(folder: Path | None, steps: int, *, lines: list[str] | None = None, spoil=None, **kwargs):
     """Train eight points."""
+    from softmode.learning.trainer import train
+
     options = {"env": "Point", "num_envs": 8, "total_steps": steps, "run_dir": folder, "eval_episodes": 0}
     options |= {"hyperparameters": SMALL, "tensorboard": False, "checkpoint_seconds": 0.0, **kwargs}
     report = (lambda line: None) if lines is None else lines.append
@@ -49,6 +48,8 @@ def rows(folder: Path) -> list[dict[str, str]]:
 
 def test_what_a_run_leaves(tmp_path: Path, monkeypatch):
     """A folder by environment and time, its configuration, a table, checkpoints, scalars, the evaluation."""
+    import torch
+
     pytest.importorskip("tensorboard")
     monkeypatch.chdir(tmp_path)
     lines: list[str] = []
@@ -194,6 +195,8 @@ def test_the_guard_writes_what_led_to_a_bad_value(tmp_path: Path, reward_nan: bo
 
 def test_without_the_guard_a_bad_loss_stops_too(tmp_path: Path):
     """The update is skipped, the checkpoint before it can be loaded, and the error names the remedy."""
+    from softmode.learning.policy import load_policy
+
     with pytest.raises(TrainingDiverged, match="nan-guard"):
         run(tmp_path / "run", 6400, spoil={"nan_at": (45, 5)})
     load_policy(tmp_path / "run" / "latest.npz")

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tests.needs import needs
 from tests.robots.files import write_arm5
 
-pytest.importorskip("tyro", reason="needs the extra [demo]")
-pytest.importorskip("matplotlib", reason="needs the extra [viz]")
+pytestmark = needs("tyro", "matplotlib")
 
 
 def test_check_prints_and_draws(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

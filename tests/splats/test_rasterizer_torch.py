@@ -13,14 +13,17 @@ from softmode.splats.rasterizer import SplatRasterizer
 from softmode.splats.rasterizer_adjoint import AdjointRasterizer
 from softmode.splats.rasterizer_torch import INPUTS, render
 from softmode.splats.splats import rotations_from_quats
+from tests.needs import needs
 from tests.splats.dense_reference import render_dense
 from tests.splats.test_rasterizer_adjoint import FULL, HEIGHT, TOLERANCE, WIDTH, Scene, deviation
 
-torch = pytest.importorskip("torch", reason="PyTorch is not installed (extra [rl])")
+pytestmark = needs("torch")
 
 
 def case(coefficients: int = 4) -> tuple[Scene, AdjointRasterizer, Any, Any, dict[str, Any]]:
     """Return a scene, its adjoint, arrays, and all of them as tensors that want gradients."""
+    import torch
+
     scene = Scene.make(coefficients=coefficients)
     splats, views = scene.arrays("cpu")
     rasterizer = SplatRasterizer(scene.means.shape[1], 3, WIDTH, HEIGHT, device="cpu")
@@ -34,6 +37,8 @@ def case(coefficients: int = 4) -> tuple[Scene, AdjointRasterizer, Any, Any, dic
 
 def test_gradients_are_the_adjoint_s() -> None:
     """loss.backward() fills every tensor with the adjoint's gradient; an earlier frame is drawn again."""
+    import torch
+
     scene, adjoint, splats, views, tensors = case()
     assert scene.weights is not None
     weights = [torch.tensor(w, dtype=torch.float32) for w in scene.weights]
@@ -48,6 +53,8 @@ def test_gradients_are_the_adjoint_s() -> None:
 
 def test_a_frame_drawn_by_others_is_drawn_again() -> None:
     """Whoever used the rasteriser between a frame and its gradient, be it another adjoint, the gradient is the same."""
+    import torch
+
     _, adjoint, splats, views, tensors = case(1)
     other = AdjointRasterizer(adjoint.rasterizer, splats, views, camera=False)
     moved = tensors["means"].detach() + 0.1
@@ -66,6 +73,8 @@ def test_a_frame_drawn_by_others_is_drawn_again() -> None:
 
 def test_pose_and_quaternions_as_parameters() -> None:
     """Chained with an axis-angle pose and normalised quaternions: against the float64 reference, difference by six."""
+    import torch
+
     scene, adjoint, splats, views, tensors = case()
     assert scene.weights is not None
     weight = torch.tensor(scene.weights[0], dtype=torch.float32)

@@ -15,7 +15,6 @@ pytest.importorskip("pxr", reason="needs the extra [usd]")
 
 import newton
 import warp as wp
-from newton.solvers import SolverXPBD
 
 from softmode.deformables.build.build_body import build_body
 from softmode.deformables.build.options import BuildOptions
@@ -415,6 +414,8 @@ def test_cloth_and_sand_are_left_to_newton(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_newton_steps_its_own_beside_the_toy(tmp_path: Path) -> None:
     """A step of Newton's solver before softmode's, between the same states, moves the cloth alone."""
+    from newton.solvers import SolverXPBD
+
     builder = newton.ModelBuilder()
     found = add_usd(builder, cloth_and_sand(tmp_path / "a.usda"), build_options=SMALL, surface_count=100)
     model = builder.finalize()

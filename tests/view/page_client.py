@@ -8,13 +8,12 @@ from __future__ import annotations
 import json
 import sys
 import time
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import msgspec
 import numpy as np
-import viser
-import zstandard
-from websockets.sync.client import ClientConnection, connect
+
+if TYPE_CHECKING:
+    from websockets.sync.client import ClientConnection
 
 CAMERA = {
     "type": "ViewerCameraMessage",
@@ -40,6 +39,9 @@ class PageClient:
 
     def __init__(self, url: str, *, origin: str | None = None) -> None:
         """Connect and say where the camera is, which is when viser counts a client."""
+        import viser
+        from websockets.sync.client import connect
+
         protocol: Any = f"viser-v{viser.__version__}"
         self.socket: ClientConnection = connect(
             url.replace("http://", "ws://"), subprotocols=[protocol], origin=origin, max_size=None, compression=None
@@ -56,10 +58,15 @@ class PageClient:
 
     def send(self, message: dict[str, Any]) -> None:
         """Send one message, "type" and its fields."""
+        import msgspec
+
         self.socket.send(msgspec.msgpack.encode(message))
 
     def receive(self, timeout: float | None = None) -> tuple[list[dict[str, Any]], list[bytes], int]:
         """Return the messages of the next packet, the arrays that they refer to, and its size [bytes]."""
+        import msgspec
+        import zstandard
+
         raw = self.socket.recv(timeout)
         assert isinstance(raw, bytes)
         compressed = int.from_bytes(raw[8:16], "little")

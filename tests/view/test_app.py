@@ -21,10 +21,11 @@ from softmode.view.app import ViewApp, ViewOptions
 from softmode.view.gaussians import GaussianBuffer
 from softmode.view.live_types import SplatPicture
 from softmode.view.session import LiveSession
+from tests.needs import needs
+from tests.view.page_client import PageClient
 from tests.view.serving import Served, served
 
-pytest.importorskip("viser", reason="the extra viz is not installed")
-from tests.view.page_client import PageClient
+pytestmark = needs("viser")
 
 NAME = "/grips"
 

@@ -17,13 +17,11 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
+from tests.needs import needs
 from tests.view.serving import Served, served
 
-pytest.importorskip("viser", reason="the extra viz is not installed")
-playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-
 CHROMIUM = os.environ.get("CHROMIUM") or shutil.which("chromium") or shutil.which("google-chrome")
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed")
+pytestmark = [needs("viser", "playwright"), pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed")]
 FLAGS = (
     "--headless=new --no-sandbox --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader "
     "--disable-background-networking --disable-component-update --disable-sync --no-first-run"
@@ -43,7 +41,9 @@ def view() -> Iterator[Served]:
 @pytest.fixture(scope="module")
 def page(view: Served) -> Iterator[Any]:
     """Open the page and wait until the object is drawn in its full colours."""
-    with playwright.sync_playwright() as driver:
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
         try:
             page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})

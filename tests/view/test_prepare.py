@@ -21,12 +21,11 @@ from softmode.objects import ObjectConfig
 from softmode.objects.source import object_source
 from softmode.splats import make_plush, read_splats, write_splats
 from softmode.view.app import ViewOptions, _free_port
-
-pytest.importorskip("viser", reason="the extra viz is not installed")
-from websockets.exceptions import WebSocketException
-
 from softmode.view.prepare import PreparePage
+from tests.needs import needs
 from tests.view.page_client import PageClient
+
+pytestmark = needs("viser")
 
 
 @pytest.fixture(scope="module")
@@ -106,6 +105,8 @@ def press(client: PageClient, label: str, ends: float) -> None:
 
 def told_until(client: PageClient, ends: float, last: str | None) -> list[str]:
     """Return what the page says from now on, until its server ends or it says `last`."""
+    from websockets.exceptions import WebSocketException
+
     told: list[str] = []
     with contextlib.suppress(WebSocketException):
         while time.monotonic() < ends and not (last and any(last in text for text in told)):
@@ -119,6 +120,8 @@ def pressed(url: str, label: str, last: str | None = None) -> list[str]:
 
     Returns what the page says from then on, until its server ends or it says `last`.
     """
+    from websockets.exceptions import WebSocketException
+
     ends = time.monotonic() + 120.0
     while time.monotonic() < ends:
         with contextlib.suppress(OSError, WebSocketException, TimeoutError), PageClient(url) as client:

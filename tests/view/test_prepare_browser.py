@@ -19,14 +19,12 @@ from softmode.objects import ObjectConfig
 from softmode.objects.source import object_source
 from softmode.splats import make_plush, write_splats
 from softmode.view.app import ViewOptions, _free_port
-
-pytest.importorskip("viser", reason="the extra viz is not installed")
-
 from softmode.view.prepare import ARC, PreparePage
+from tests.needs import needs
 from tests.view.page_client import PageClient
-from tests.view.test_browser import CHROMIUM, FLAGS, playwright, until
+from tests.view.test_browser import CHROMIUM, FLAGS, until
 
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed")
+pytestmark = [needs("viser", "playwright"), pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed")]
 SIZE = (1100, 480)
 """Width and height of the page [px]; the panel lies beside the gizmos."""
 ARROW = 0.22
@@ -82,6 +80,8 @@ class Hand:
 
 def test_gizmos_in_a_browser_prepare_what_is_shown(tmp_path: Path) -> None:
     """A bear is laid down and set up again by arcs, and half of it cut by a corner: command line and body follow."""
+    from playwright.sync_api import sync_playwright
+
     file, bear = tmp_path / "toy bear.ply", make_plush(count=800)
     away = bear.means + np.float32([0.3, 0.0, 0.2])  # captures lie far from the file's origin
     write_splats(file, replace(bear, means=away), up="+x")
@@ -91,7 +91,7 @@ def test_gizmos_in_a_browser_prepare_what_is_shown(tmp_path: Path) -> None:
     with (
         subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as running,
         PreparePage(file, ViewOptions(port=0), up="+x") as twin,
-        playwright.sync_playwright() as driver,
+        sync_playwright() as driver,
     ):
         try:
             assert running.stdout is not None

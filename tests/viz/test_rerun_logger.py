@@ -33,9 +33,11 @@ from softmode.scenes import BoundSplats, SplatFrame
 from softmode.splats.splats import rotations_from_quats
 from softmode.viz.rerun_logger import RerunLogger, RerunOptions
 from softmode.viz.rerun_sources import RerunScene
+from tests.needs import needs
 from tests.scenes import GRAVITY, Scene
 
-pytest.importorskip("rerun", reason="needs the extra viz")
+pytestmark = needs("rerun")
+
 
 TWICE = np.array([1, 2, 2, 1, 2, 1])
 """How often an entry of xx xy xz yy yz zz stands in the matrix."""
