@@ -5,13 +5,18 @@ from __future__ import annotations
 import gc
 import os
 import sys
+from collections.abc import Callable
 from importlib.metadata import entry_points
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
 from tests.build_sources import sources_hash
 from tests.compile_once import compile_once
+
+if TYPE_CHECKING:
+    import gymnasium as gym
 
 gc.disable()  # until all tests are collected: it takes a quarter of the time, and imports leave next to no garbage
 
@@ -120,6 +125,22 @@ def playbot() -> Path:
     if not PLAYBOT.is_file():
         pytest.skip(f"the trained capture {PLAYBOT} is not there")
     return PLAYBOT
+
+
+@pytest.fixture(scope="session")
+def make_env(soft_env: Callable[..., gym.Env]) -> Callable[..., gym.Env]:
+    """Return a function from a task and an obs_type to the one environment of them that all tests of a run share.
+
+    Building one takes as long as hundreds of steps. A test begins with a reset by a seed or options, and puts back what
+    no reset does.
+    """
+
+    def make(task: str, obs_type: str = "state") -> gym.Env:
+        """Return the environment as it is registered; where it draws pictures, with the cameras of films."""
+        films = {} if obs_type == "state" else {"render_mode": "rgb_array"}
+        return soft_env(f"softmode/{task}-v0", obs_type=obs_type, **films)
+
+    return make
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

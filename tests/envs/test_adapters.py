@@ -40,15 +40,15 @@ def lift() -> Iterator[Any]:
 @pytest.fixture(scope="module")
 def pixels() -> Iterator[Any]:
     """Return one world with small pictures."""
-    from softmode.envs.tasks.lift_soft.task import LiftSoftConfig
+    from softmode.envs.tasks.push_soft.task import PushSoftConfig
 
     env = gym.make_vec(
-        "softmode/LiftSoft-v0",
+        "softmode/PushSoft-v0",
         num_envs=1,
         output="torch",
         obs_type="pixels_agent_pos",
         autoreset_mode=AutoresetMode.SAME_STEP,
-        config=LiftSoftConfig(image_size=36),
+        config=PushSoftConfig(image_size=36),
     )
     yield env
     env.close()

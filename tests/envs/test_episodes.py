@@ -25,9 +25,9 @@ LIMITS = {
 
 
 @pytest.mark.parametrize("task", LIMITS)
-def test_a_scripted_episode(soft_env: MakeEnv, episode: Episodes, task: str) -> None:
+def test_a_scripted_episode(make_env: MakeEnv, episode: Episodes, task: str) -> None:
     """With seed 2, whatever the material that it draws."""
-    played = episode(soft_env(f"softmode/{task}-v0"), "scripted", 2)
+    played = episode(make_env(task), "scripted", 2)
     assert_success(played)
     assert_no_flag(played, allow=["iteration_limit"])
     force, depth = LIMITS[task]

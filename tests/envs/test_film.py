@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from softmode.envs import LiftSoftConfig
 from softmode.learning.players import policy_factory
+from tests.envs.conftest import MakeEnv
 
 EDGE = 128
 
@@ -65,15 +66,13 @@ def test_what_a_film_shows(lift: gym.Env) -> None:
     assert 0.02 < min(shares) and max(shares) < 0.4
 
 
-def test_films_leave_observations_as_they_are() -> None:
+def test_films_leave_observations_as_they_are(make_env: MakeEnv) -> None:
     """Pictures for a policy are the same, bit for bit, with film cameras and without, before and after a frame."""
     pictures = []
-    for mode in (None, "rgb_array"):
-        env = gym.make("softmode/LiftSoft-v0", obs_type="pixels", render_mode=mode)
+    for env in (gym.make("softmode/PushSoft-v0", obs_type="pixels"), make_env("PushSoft", "pixels")):
         first, _ = env.reset(seed=3)
         env.render()
         second, *_ = env.step(np.array([0.3, -0.2, -0.8, 0.1, 1.0], np.float32))
         pictures.append((first, second))
-        env.close()
     for without, with_film in zip(*pictures, strict=True):
         np.testing.assert_array_equal(without, with_film)

@@ -1,29 +1,23 @@
-"""The environment contract of softmode/LiftSoft-v0: checkers, seeding, spaces, reward, errors, episodes' ends."""
+"""LiftSoft: seeding, copies, reward, errors, the ends of episodes, pictures; what no checker of all tasks asks."""
 
 from __future__ import annotations
 
 import functools
-import multiprocessing
 import pickle
-import warnings
-from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import warp as wp
-from gymnasium.utils.env_checker import check_env, data_equivalence
+from gymnasium.utils.env_checker import data_equivalence
 
 import softmode
 from softmode.deformables.model.status import status_reasons
 from softmode.envs.task_kernels import bound_observation
 from softmode.envs.tasks.lift_soft.task import LiftSoftConfig, LiftSoftEnv
 from softmode.errors import ConfigError, MaterialError
-
-ENV_ID = "softmode/LiftSoft-v0"
-OBS_TYPES = ["state", "pixels", "pixels_agent_pos"]
-MakeEnv = Callable[[str], gym.Env]
+from tests.envs.conftest import MakeEnv
 
 
 def actions(env: gym.Env, count: int, seed: int = 0) -> np.ndarray:
@@ -37,89 +31,31 @@ def rollout(env: gym.Env, count: int, **reset: Any) -> list[Any]:
     return [env.reset(**reset), *(env.step(action) for action in actions(env, count))]
 
 
-# -- checkers ---------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("obs_type", OBS_TYPES)
-def test_gymnasium_checker_has_nothing_to_say(make_env: MakeEnv, obs_type: str) -> None:
-    """`check_env` of gymnasium passes without a warning.
-
-    It makes an environment for each way to render and one to close, which know nothing of observations: once is enough.
-    """
-    once = obs_type != "state"
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        check_env(make_env(obs_type).unwrapped, skip_render_check=once, skip_close_check=once)
-
-
-@pytest.mark.parametrize("obs_type", OBS_TYPES)
-def test_stable_baselines3_checker_has_nothing_to_say(make_env: MakeEnv, obs_type: str) -> None:
-    """`check_env` of stable-baselines3 passes without a warning."""
-    pytest.importorskip("torch", reason="stable-baselines3 needs torch")
-    checker = pytest.importorskip(
-        "stable_baselines3.common.env_checker", reason="install stable-baselines3 to check its contract"
-    )
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        checker.check_env(make_env(obs_type).unwrapped, warn=True, skip_render_check=False)
-
-
 def test_id_is_listed() -> None:
     """The package registers exactly the environments that it documents."""
     assert set(softmode.ENVIRONMENTS) == {name for name in gym.registry if name.startswith("softmode/")}
 
 
-@pytest.mark.parametrize("obs_type", OBS_TYPES)
-def test_observations_lie_in_a_finite_space(make_env: MakeEnv, obs_type: str) -> None:
-    """Every observation is contained; no bound is infinite."""
-    env = make_env(obs_type)
-    for result in rollout(env, 5, seed=0):
-        assert env.observation_space.contains(result[0])
-    spaces = env.observation_space.values() if isinstance(env.observation_space, gym.spaces.Dict) else []
-    for space in [*spaces] or [env.observation_space]:
-        assert isinstance(space, gym.spaces.Box)
-        assert np.isfinite(space.low).all() and np.isfinite(space.high).all()
+# -- seeds and copies --------------------------------------------------------------------------------------------------
 
 
-# -- seeds and processes ----------------------------------------------------------------------------------------------
+def test_two_environments_in_turn_are_each_as_alone(lift: LiftSoftEnv) -> None:
+    """Stepped in turn, this one and one of the factory that worker processes get return what each returns alone.
 
-
-def test_fresh_processes_repeat_an_episode_bitwise(make_env: MakeEnv) -> None:
-    """One seed gives the same bits in two fresh processes, and in this one, which has played before.
-
-    The processes are those of an AsyncVectorEnv; "forkserver" starts them anew, since Warp's threads survive no fork,
-    from a process that has imported the simulator once for both and does not initialise it. "softmode:" in the id
-    imports the package there.
+    Observations, rewards and infos, bit for bit: also Gymnasium's own rule that equal seeds and actions of a registered
+    id give equal results. Closing twice does no harm.
     """
-    multiprocessing.set_forkserver_preload(["mujoco_warp", LiftSoftEnv.__module__])
-    factory = functools.partial(gym.make, f"softmode:{ENV_ID}", obs_type="pixels_agent_pos")
-    single = rollout(make_env("pixels_agent_pos"), 30, seed=7)
-    envs = gym.vector.AsyncVectorEnv([factory, factory], context="forkserver", shared_memory=False)
+    other = pickle.loads(pickle.dumps(functools.partial(gym.make, "softmode/LiftSoft-v0")))()
     try:
-        observation, _ = envs.reset(seed=[7, 7])
-        rewards = None
-        for step in range(31):
-            if step:
-                action = actions(make_env("pixels_agent_pos"), 30)[step - 1]
-                observation, rewards, *_ = envs.step(np.stack([action, action]))
-            for key in ("pixels", "agent_pos"):
-                np.testing.assert_array_equal(observation[key][0], observation[key][1])
-                np.testing.assert_array_equal(observation[key][0], single[step][0][key])
-            if rewards is not None:
-                assert rewards[0] == rewards[1] == single[step][1]
-    finally:
-        envs.close()
-
-
-def test_two_instances_are_exactly_equal(lift: LiftSoftEnv) -> None:
-    """Gymnasium's own rule for a registered id: equal seeds and actions give equal observations, rewards and infos."""
-    other = gym.make(ENV_ID)
-    try:
-        first, second = rollout(lift, 20, seed=3), rollout(other, 20, seed=3)
-        assert data_equivalence(first, second, exact=True)
+        first, second = [lift.reset(seed=4)], [other.reset(seed=9)]
+        for action in actions(lift, 6):
+            first.append(lift.step(action))
+            second.append(other.step(action))
+        assert data_equivalence(first, rollout(other, 6, seed=4), exact=True)
+        assert data_equivalence(second, rollout(lift, 6, seed=9), exact=True)
     finally:
         other.close()
-        other.close()  # twice does no harm
+        other.close()
 
 
 def test_seed_decides_the_draw_and_the_stream_goes_on(lift: LiftSoftEnv) -> None:
@@ -154,27 +90,6 @@ def test_pickled_environment_plays_the_same_episode(joints: LiftSoftEnv) -> None
     copy = pickle.loads(pickle.dumps(env))
     assert copy.config == env.config and copy.action_space == env.action_space
     assert data_equivalence(rollout(env, 3, seed=1), rollout(copy, 3, seed=1), exact=True)
-
-
-# -- vector environments ----------------------------------------------------------------------------------------------
-
-
-def test_vector_environment_equals_single_ones(lift: LiftSoftEnv) -> None:
-    """Two copies side by side in one process, made by a factory that can be pickled, return what single ones do."""
-    factory = pickle.loads(pickle.dumps(functools.partial(gym.make, ENV_ID)))
-    envs = gym.vector.SyncVectorEnv([factory, factory])
-    try:
-        observations, _ = envs.reset(seed=[4, 9])
-        chosen = actions(lift, 3)
-        rewards = np.zeros(2)
-        for action in chosen:
-            observations, rewards, *_ = envs.step(np.stack([action, action]))
-        for k, seed in enumerate((4, 9)):
-            single = rollout(lift, 3, seed=seed)[-1]
-            np.testing.assert_array_equal(observations[k], single[0])
-            assert rewards[k] == single[1]
-    finally:
-        envs.close()
 
 
 # -- options and errors -----------------------------------------------------------------------------------------------
@@ -288,7 +203,7 @@ def test_configuration_is_checked(given: dict[str, Any]) -> None:
 
 def test_results_are_never_reused(make_env: MakeEnv) -> None:
     """What a step returned does not change with the next steps, be it observation, info or picture."""
-    env = make_env("pixels_agent_pos")
+    env = make_env("LiftSoft", "pixels_agent_pos")
     observation, info = env.reset(seed=0)
     frame = env.render()
     assert isinstance(frame, np.ndarray)
@@ -331,7 +246,7 @@ def test_reward_is_the_sum_of_its_terms(lift: LiftSoftEnv) -> None:
 
 def test_episode_is_truncated_by_its_limit(make_env: MakeEnv) -> None:
     """`gym.make` ends an idle episode after 150 steps, by truncation."""
-    env = make_env("state")
+    env = make_env("LiftSoft")
     env.reset(seed=0)
     idle = np.array([0.0, 0.0, 0.0, 0.0, 1.0], np.float32)
     ends = [env.step(idle)[2:4] for _ in range(150)]
@@ -422,8 +337,9 @@ def test_joint_actions_move_the_joints(joints: LiftSoftEnv) -> None:
 # -- pictures ---------------------------------------------------------------------------------------------------------
 
 
-def test_frame_shows_two_views(lift: LiftSoftEnv) -> None:
+def test_frame_shows_two_views(make_env: MakeEnv) -> None:
     """A frame is uint8 (edge, 2 edge, 3), neither half blank; without a render mode there is none."""
+    lift: Any = make_env("LiftSoft", "pixels_agent_pos").unwrapped
     lift.reset(seed=0)
     frame = lift.render()
     edge = lift.config.render_size
@@ -439,11 +355,9 @@ def test_frame_shows_two_views(lift: LiftSoftEnv) -> None:
 
 def test_camera_sees_where_the_object_is(make_env: MakeEnv) -> None:
     """Moved to the side, the object moves in the picture; with equal options the picture has equal bits."""
-    env = make_env("pixels")
-    place = {"yaw": 0.0, "youngs_modulus": 1.0e5}
-    left, right, again = (
-        env.reset(seed=0, options={**place, "position": (0.45, y)})[0].astype(int) for y in (-0.05, 0.05, -0.05)
-    )
+    env = make_env("LiftSoft", "pixels_agent_pos")
+    options = [{"yaw": 0.0, "youngs_modulus": 1.0e5, "position": (0.45, y)} for y in (-0.05, 0.05, -0.05)]
+    left, right, again = (env.reset(seed=0, options=given)[0]["pixels"].astype(int) for given in options)
     np.testing.assert_array_equal(left, again)
     changed = np.abs(left - right).sum(axis=2) > 60
     assert 0.005 < changed.mean() < 0.3

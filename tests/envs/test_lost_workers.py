@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import gymnasium as gym
@@ -18,44 +17,37 @@ TASK = "softmode/PushSoft-v0"
 REST = np.zeros((2, 5), np.float32)
 
 
-@pytest.fixture
-def shared() -> Iterator[Any]:
-    """Return two worlds in two processes."""
-    env = gym.make_vec(TASK, num_envs=2, processes=2)
-    yield env
-    env.close()
-
-
-def test_a_process_that_died_is_reported_and_close_stops_the_others(shared: Any) -> None:
-    """Every call raises WorkerError, `close` does not, and no process is left."""
-    shared.reset(seed=0)
-    processes = [worlds._process for worlds in shared._worlds]
-    processes[0].kill()
-    processes[0].join()
-    for _ in range(2):
-        with pytest.raises(WorkerError, match="has died"):
-            shared.step(REST)
-    shared.close()
-    assert not any(process.is_alive() for process in processes)
-    with pytest.raises(WorkerError, match="closed"):
-        shared.step(REST)
-
-
-def test_an_answer_that_nobody_took_is_not_that_of_the_next_call(shared: Any) -> None:
-    """After an error in one process the next reset returns its own observations, in both."""
-    expected = shared.reset(seed=0)[0]
-    shared.step(REST + 1.0)
-    first, second = shared._worlds
+def test_processes_that_fail_and_die() -> None:
+    """After an error in one process the next reset returns its own observations, in both: an answer that nobody took is
+    not that of the next call. With a process that died every call raises WorkerError, `close` does not, and no process
+    is left.
+    """  # noqa: D205
+    env: Any = gym.make_vec(TASK, num_envs=2, processes=2)
+    expected = env.reset(seed=0)[0]
+    env.step(REST + 1.0)
+    first, second = env._worlds
     first._send("no such call")
     second._send("step", REST[1:])
     with pytest.raises(WorkerError, match="AttributeError"):
         first.result()
-    np.testing.assert_array_equal(shared.reset(seed=0)[0], expected)
+    np.testing.assert_array_equal(env.reset(seed=0)[0], expected)
+    processes = [worlds._process for worlds in env._worlds]
+    processes[0].kill()
+    processes[0].join()
+    for _ in range(2):
+        with pytest.raises(WorkerError, match="has died"):
+            env.step(REST)
+    env.close()
+    assert not any(process.is_alive() for process in processes)
+    with pytest.raises(WorkerError, match="closed"):
+        env.step(REST)
 
 
 def test_final_info_tells_the_solver_status_of_the_episode_that_ended() -> None:
-    """The reset of SAME_STEP clears the status of the new episode only."""
+    """The reset of SAME_STEP clears the status of the new episode only; before the first reset there is no state."""
     env: Any = gym.make_vec(TASK, num_envs=2, autoreset_mode=AutoresetMode.SAME_STEP)
+    with pytest.raises(ConfigError, match="before the first reset"):
+        _ = env.state_observation
     env.reset(seed=0)
     memory, data = env.task.scene.state.softmode, env.task.scene.model.softmode
     q = memory.q.numpy().copy()
@@ -83,10 +75,7 @@ def test_bad_arguments_are_refused_with_typed_errors(given: dict[str, Any], erro
         gym.make_vec(TASK, num_envs=1, **given)
 
 
-def test_a_limit_is_whole_and_there_is_no_state_before_a_reset() -> None:
-    """Both are said, not left to a kernel launch or an index."""
+def test_a_limit_is_whole() -> None:
+    """It is said, not left to a kernel launch."""
     with pytest.raises(ConfigError, match="max_episode_steps"):
         gym.make_vec(TASK, num_envs=1, max_episode_steps=2.5)
-    env: Any = gym.make_vec(TASK, num_envs=1)
-    with pytest.raises(ConfigError, match="before the first reset"):
-        _ = env.state_observation

@@ -1,4 +1,8 @@
-"""Another object in every world: each world is the single environment with its object, bit for bit."""
+"""Another object in every world: each world is the single environment with its object, bit for bit.
+
+Of the tasks but LiftSoft that is tested in every run where objects change, in test_object_resets, and here over whole
+episodes.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +17,7 @@ import numpy as np
 import pytest
 
 import softmode  # noqa: F401  (registers the environments)
-from softmode.deformables import BuildOptions, Material
+from softmode.deformables import Material
 from softmode.envs import (
     LiftSoftConfig,
     LiftSoftEnv,
@@ -37,67 +41,36 @@ from softmode.envs import (
 )
 from softmode.envs.tasks.place_in_bin.task import PlaceInBin
 from softmode.envs.tasks.rope_route.task import RopeRoute, rope_scene
-from softmode.envs.tasks.shape_soft.config import POST, POST_MATERIAL
+from softmode.envs.tasks.shape_soft.config import POST
 from softmode.errors import ConfigError, GraspError, StateError
 from softmode.learning.config_values import config_of, pinned_options, values_of
 from softmode.objects import ObjectConfig, ObjectSet
-from softmode.objects.task_objects import ROPE_MATERIAL
 from softmode.scenes import BoundSplats
 from softmode.splats import make_plush, write_splats
+from tests.envs.object_kinds import (
+    BALL,
+    CUBE,
+    KINDS,
+    MATERIALS,
+    PLACE,
+    ROD,
+    actions,
+    alone,
+    alone_in,
+    lift,
+    lift_alone,
+    posts,
+    ropes,
+)
 
 STEPS = 26
-CUBE = ObjectConfig(
-    shape="box",
-    extents=(0.05, 0.05, 0.05),
-    surface_count=90,
-    splat_count=400,
-    build=BuildOptions(mode_count=2, kernel_count=120, cubature_count=64),
-)
-BALL = ObjectConfig(
-    shape="sphere",
-    extents=(0.06, 0.06, 0.06),
-    surface_count=150,
-    splat_count=700,
-    build=BuildOptions(mode_count=4, kernel_count=150, cubature_count=96),
-)
-ROD = ObjectConfig(
-    shape="cylinder",
-    extents=(0.04, 0.04, 0.06),
-    surface_count=110,
-    splat_count=550,
-    build=BuildOptions(mode_count=3, kernel_count=120, cubature_count=80),
-)
-KINDS = (CUBE, BALL, ROD)
-MATERIALS = (
-    Material(youngs_modulus=8.0e4, density=300.0),
-    Material(youngs_modulus=4.0e4, density=120.0, friction=1.0),
-    Material(youngs_modulus=3.0e5, density=500.0, poissons_ratio=0.4),
-)
 SET = ObjectSet(KINDS, materials=MATERIALS, order="in_turn")
-PLACE = {"position": (0.45, 0.0)}
-
-
-def lift(**changes: Any) -> LiftSoftConfig:
-    """Return LiftSoft with the set, every object of its own material."""
-    return LiftSoftConfig(**{"objects": SET, "youngs_modulus_range": None, "image_size": 48, **changes})
-
-
-def alone(config: Any, k: int) -> Any:
-    """Return the configuration of the single environment with object k."""
-    scene = replace(config.scene, object=KINDS[k], material=MATERIALS[k])
-    return replace(config, objects=None, objects_one_hot=False, scene=scene)
-
-
-def actions(world_count: int, step: int) -> np.ndarray:
-    """Return actions that go down, close and rise, and differ from world to world."""
-    down = np.array([0.0, 0.0, -1.0 if step < 14 else 0.6, 0.0, 1.0 if step < 12 else -1.0], np.float32)
-    return down + np.random.default_rng(step).uniform(-0.3, 0.3, (world_count, 5)).astype(np.float32)
 
 
 def test_each_world_lifts_as_alone() -> None:
     """Observation, reward, ends, info and picture of world i have the bits of the single environment, with contact."""
     count, seed = len(KINDS), 3
-    config = lift(objects_one_hot=True, image_outputs=("segmentation",))
+    config = lift(SET, objects_one_hot=True, image_outputs=("segmentation",))
     many = LiftSoftVectorEnv(count, config=config, obs_type="pixels", device="cpu")
     pictures, infos = many.reset(seed=seed, options=PLACE)
     assert infos["object"].tolist() == [0, 1, 2]
@@ -112,7 +85,7 @@ def test_each_world_lifts_as_alone() -> None:
     np.testing.assert_array_equal(seen[-1][:, code], np.eye(count))
     assert all(max(result[5][k].max() for result in results) > 0.1 for k in range(count))  # fingers touch
     for k in range(count):
-        single = LiftSoftEnv(config=alone(many.config, k), obs_type="pixels", device="cpu")
+        single = lift_alone(k)
         picture, info = single.reset(seed=seed + k, options=PLACE)
         assert info["parameters"]["density"] == np.float32(MATERIALS[k].density)
         for step in range(STEPS + 1):
@@ -125,6 +98,7 @@ def test_each_world_lifts_as_alone() -> None:
                 assert mine == tuple(part[k] for part in results[step][:5])
 
 
+@pytest.mark.rest
 def test_each_world_is_pushed_as_alone() -> None:
     """The same for PushSoft, whose reward knows the shape; the film has the outline of each object as its goal."""
     count = len(KINDS)
@@ -151,6 +125,7 @@ def test_each_world_is_pushed_as_alone() -> None:
         np.testing.assert_array_equal(picture, film[k])
 
 
+@pytest.mark.rest
 def test_each_world_is_pressed_as_alone() -> None:
     """The same for PressSoft, whose gauge knows how high a pad is."""
     pads, foam = (CUBE, replace(ROD, extents=(0.06, 0.06, 0.03))), Material(youngs_modulus=1.0e5, poissons_ratio=0.4)
@@ -214,6 +189,7 @@ def place_in_bin(**changes: Any) -> PlaceInBinConfig:
     return PlaceInBinConfig(**{"objects": toys, "youngs_modulus_range": None, **changes})
 
 
+@pytest.mark.rest
 def test_each_toy_is_placed_as_alone() -> None:
     """World i of PlaceInBin, whose reward knows size and height, has the bits of the single environment; both win."""
     config = place_in_bin()
@@ -229,20 +205,7 @@ def test_toys_fit_the_bin() -> None:
         PlaceInBinEnv(config=place_in_bin(objects=ObjectSet([CUBE, bar], order="in_turn", first_world=1)), device="cpu")
 
 
-def posts(**options: Any) -> ObjectSet:
-    """Return posts of two widths and heights, the second with more samples and functions."""
-    other = replace(POST, extents=(0.026, 0.026, 0.13), surface_count=270, build=BuildOptions(mode_count=3))
-    given = (replace(POST_MATERIAL, youngs_modulus=1.0e5), replace(POST_MATERIAL, density=400.0))
-    return ObjectSet((POST, other), materials=given, **options)
-
-
-def alone_in(config: Any, k: int) -> Any:
-    """Return the configuration of the single environment with object k, of its material."""
-    given = config.objects
-    scene = replace(config.scene, object=given.objects[k], material=given.materials[k])
-    return replace(config, objects=None, scene=scene)
-
-
+@pytest.mark.rest
 def test_each_post_is_bent_as_alone() -> None:
     """World i of ShapeSoft, whose targets are bends of its own post, has the bits of the single environment."""
     config = ShapeSoftConfig(objects=posts(order="in_turn"), youngs_modulus_range=None, render_size=64)
@@ -269,15 +232,7 @@ def test_posts_are_posts() -> None:
         )
 
 
-def ropes(**options: Any) -> ObjectSet:
-    """Return ropes of two lengths, radii and stiffnesses; the second has more samples and functions."""
-    first = rope_scene().object
-    build = replace(first.build, function_count=52, cubature_count=160)
-    second = replace(first, extents=(0.38, 0.018, 0.018), surface_count=180, build=build)
-    given = (ROPE_MATERIAL, replace(ROPE_MATERIAL, youngs_modulus=2.0e5, density=600.0))
-    return ObjectSet((first, second), materials=given, **options)
-
-
+@pytest.mark.rest
 def test_each_rope_is_led_as_alone() -> None:
     """World i of RopeRoute, whose axis, end and point to grasp are those of its rope, has the bits of it alone."""
     config = replace(
@@ -301,7 +256,7 @@ def test_ropes_are_ropes() -> None:
 
 def test_states_of_different_objects_go_on_as_they_did() -> None:
     """After a state, in bytes, all goes on with the same bits; a world takes another one's that has its object."""
-    config = lift(objects=replace(SET, objects=(CUBE, BALL), materials=None), youngs_modulus_range=(2.0e4, 2.0e6))
+    config = lift(replace(SET, objects=(CUBE, BALL), materials=None), youngs_modulus_range=(2.0e4, 2.0e6))
     env = LiftSoftVectorEnv(3, config=config, device="cpu")
     env.reset(seed=4, options=PLACE)
 
@@ -343,7 +298,7 @@ def test_processes_deal_out_the_same_objects() -> None:
 
 def test_runs_keep_the_set(tmp_path: Path) -> None:
     """What a checkpoint or a dataset keeps of a configuration, as JSON, makes the same set again, its files pinned."""
-    config = lift(objects=replace(SET, objects=("mug", *KINDS[1:]), size=0.07))
+    config = lift(replace(SET, objects=("mug", *KINDS[1:]), size=0.07))
     kept = json.loads(json.dumps(values_of(config)))
     assert config_of(LiftSoftConfig, kept) == config
     file = tmp_path / "toy.ply"
@@ -356,7 +311,7 @@ def test_runs_keep_the_set(tmp_path: Path) -> None:
 
 def test_scripted_policies_take_each_object() -> None:
     """The scripted policy lifts every object of the set in a vector environment."""
-    env = LiftSoftVectorEnv(len(KINDS), config=lift(), device="cpu", autoreset_mode="Disabled")
+    env = LiftSoftVectorEnv(len(KINDS), config=lift(SET), device="cpu", autoreset_mode="Disabled")
     env.reset(seed=0, options=PLACE)
     policy, solved = scripted_policy(env), np.zeros(len(KINDS), bool)
     for _ in range(200):
@@ -379,12 +334,12 @@ def test_what_cannot_take_a_set_says_so() -> None:
         OneBody(PlaceInBinConfig(objects=SET), device="cpu")
     wide = replace(CUBE, extents=(0.16, 0.16, 0.16))
     with pytest.raises(GraspError, match="box#2 does not fit the gripper"):
-        LiftSoftVectorEnv(2, config=lift(objects=ObjectSet([CUBE, wide], order="in_turn")), device="cpu")
+        LiftSoftVectorEnv(2, config=lift(ObjectSet([CUBE, wide], order="in_turn")), device="cpu")
     with pytest.raises(ConfigError, match="objects_one_hot"):
         LiftSoftConfig(objects_one_hot=True)
     with pytest.raises(ConfigError, match="size is given beside a set"):
-        LiftSoftEnv(config=lift(), size=0.05)
-    env = LiftSoftVectorEnv(2, config=lift(), device="cpu")
+        LiftSoftEnv(config=lift(SET), size=0.05)
+    env = LiftSoftVectorEnv(2, config=lift(SET), device="cpu")
     env.reset(seed=0)
     with pytest.raises(StateError, match="world 1 has object 1 of the set, the state object 0"):
         env.set_state(env.get_state().worlds([0]))

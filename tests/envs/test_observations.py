@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 
-import gymnasium as gym
 import newton
 import numpy as np
 import pytest
@@ -15,9 +13,9 @@ from scipy.spatial.transform import Rotation
 from softmode.deformables.contact.pairs import thickness
 from softmode.envs.scripted import scripted_policy
 from softmode.envs.soft_env import SoftEnv
-from softmode.envs.tasks.push_soft.task import PushSoftConfig
 from softmode.robots import ArmDescription
 from tests import reference
+from tests.envs.conftest import MakeEnv
 
 Vector = NDArray[np.float64]
 Numbers = dict[str, Vector]
@@ -220,22 +218,24 @@ TASKS: dict[str, Callable[[HostState], Numbers]] = {
     "ShapeSoft": shape_soft,
 }
 """What each task adds."""
-EPISODES = {"ShapeSoft": ({"goal": (0.05, 1.0)}, {"goal": (0.05, 1.0 - np.pi)})}
-"""Options of the episodes, where one is not enough: in ShapeSoft a finger touches the post, the other one on its way
-back."""
+EPISODES = {
+    "PushSoft": ({"goal_yaw": 0.7},),
+    "ShapeSoft": ({"goal": (0.05, 1.0)}, {"goal": (0.05, 1.0 - np.pi)}),
+}
+"""Options of the episodes: PushSoft draws no yaw of a goal by itself; in ShapeSoft a finger touches the post, the other
+one on its way back."""
 STILL = {"PressSoft": {"opening", "command_opening"}}
 """Segments that stay zero: the fingers of PressSoft are closed."""
 
 
 @pytest.mark.parametrize("name", TASKS)
-def test_every_segment_is_what_the_state_says(name: str) -> None:
+def test_every_segment_is_what_the_state_says(make_env: MakeEnv, name: str) -> None:
     """Before, in and after contact, then under random actions, every segment equals its NumPy twin within float32.
 
     Every number of every segment is far from zero at some time, so that a wrong sign or column of it shows.
     """
     own = TASKS[name]
-    given = {"config": dataclasses.replace(PushSoftConfig(), goal_yaw=(0.4, 0.9))} if name == "PushSoft" else {}
-    env = gym.make(f"softmode/{name}-v0", **given).unwrapped
+    env = make_env(name).unwrapped
     assert isinstance(env, SoftEnv)
     segments, largest, touched, dented = env.task.segments, np.zeros(len(env.task.low)), False, 0.0
 
@@ -264,7 +264,6 @@ def test_every_segment_is_what_the_state_says(name: str) -> None:
         for _ in range(10):
             env.step(random.uniform(-1.0, 1.0, env.action_space.shape).astype(np.float32))
             check()
-    env.close()
     assert touched and dented > 2.0 * TOLERANCE["atol"]
     small = {segment for segment, (columns, _) in segments.items() if (largest[columns] < VISIBLE).any()}
     assert small <= STILL.get(name, set()), {segment: largest[segments[segment][0]] for segment in small}

@@ -27,9 +27,9 @@ BESIDE, FIRST, SECOND = (0.42, -0.12), (0.43, 0.10), (0.47, 0.18)
 
 
 @pytest.fixture(scope="module")
-def env() -> PlaceInBinEnv:
+def env(make_env: MakeEnv) -> PlaceInBinEnv:
     """Return the default environment."""
-    made = gym.make(ENV_ID).unwrapped
+    made = make_env("PlaceInBin").unwrapped
     assert isinstance(made, PlaceInBinEnv)
     return made
 
@@ -286,12 +286,6 @@ def test_rough_play_breaks_nothing() -> None:
     assert 0 < deep < 0.02 * 4 * 2000
 
 
-def test_script_needs_its_own_environment() -> None:
-    """Another environment is refused."""
-    with pytest.raises(ConfigError, match="PlaceInBin"):
-        ScriptedPlace(gym.make("CartPole-v1"))
-
-
 def test_worlds_equal_single_environments(env: PlaceInBinEnv) -> None:
     """World i of two plays bitwise what the single environment plays with its seed, soft bodies touching each other."""
     touching = {"other_position_1": (0.43, 0.14), "other_position_2": (0.477, 0.14)}
@@ -346,8 +340,9 @@ def test_things_need_room_to_start(config: PlaceInBinConfig, message: str) -> No
         PlaceInBinEnv(config=config)
 
 
+@pytest.mark.rest
 def test_an_empty_bin_will_do() -> None:
-    """Without other objects the task is the same, its observation shorter."""
+    """Without other objects the task is the same, its observation shorter, as for the sets of test_object_resets."""
     env = PlaceInBinEnv(config=PlaceInBinConfig(scene=replace(bin_scene(), others=())))
     assert "other_offsets" not in env.task.segments
     info, _ = play(env, 0)

@@ -1,32 +1,28 @@
-"""PushSoft: observation, reward and success in constructed states, forces of pushing, scripted pushes, worlds."""
+"""PushSoft: observation, reward and success in constructed states, forces of pushing, scripted pushes."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 
-import softmode  # noqa: F401  (registers the environments)
 from softmode.deformables.build.options import BuildOptions
 from softmode.envs.scripted import scripted_policy
-from softmode.envs.tasks.push_soft.scripted import ScriptedPush
 from softmode.envs.tasks.push_soft.task import PushSoftConfig, PushSoftEnv, push_scene
 from softmode.errors import ConfigError
 from softmode.objects import ObjectConfig
 from softmode.testing import assert_success
 from tests.envs.conftest import Episodes, MakeEnv
 
-ENV_ID = "softmode/PushSoft-v0"
 IDLE = np.zeros(5, np.float32)
 
 
 @pytest.fixture(scope="module")
-def push() -> PushSoftEnv:
+def push(make_env: MakeEnv) -> PushSoftEnv:
     """Return the default environment."""
-    env = gym.make(ENV_ID).unwrapped
+    env = make_env("PushSoft").unwrapped
     assert isinstance(env, PushSoftEnv)
     return env
 
@@ -157,7 +153,10 @@ def test_pushing_takes_the_force_of_friction(push: PushSoftEnv) -> None:
 
 
 def test_yaw_counts_where_it_is_asked_for() -> None:
-    """With `yaw_tolerance` a box at the goal but turned too far is not there; `goal` pays less for it."""
+    """With `yaw_tolerance` a box at the goal but turned too far is not there; `goal` pays less for it.
+
+    The environment is another one: what is turned shows on a box, and the tolerance is configured.
+    """
     box = ObjectConfig(
         shape="box", extents=(0.06, 0.05, 0.04), surface_count=80, build=BuildOptions(mode_count=3, cubature_count=48)
     )
@@ -196,32 +195,6 @@ def test_script_succeeds_on_twenty_of_twenty_seeds(
 ) -> None:
     """20 of 20 seeds with random stiffness, place and goal."""
     assert_success(episode(soft_env("softmode/PushSoft-v0", goal_direction=directions)))
-
-
-def test_script_needs_its_own_environment() -> None:
-    """Another environment is refused."""
-    with pytest.raises(ConfigError, match="PushSoft"):
-        ScriptedPush(gym.make("CartPole-v1"))
-    with pytest.raises(ConfigError, match="scripted"):
-        scripted_policy(gym.make("CartPole-v1"))
-
-
-def test_worlds_equal_single_environments(push: PushSoftEnv) -> None:
-    """World i of two plays bitwise what the single environment plays with its seed."""
-    envs = gym.make_vec(ENV_ID, num_envs=2)
-    observations, _ = envs.reset(seed=5)
-    forward = np.array([0.8, 0.1, 0.0, 0.2, 0.0], np.float32)
-    history, rewards = [observations], []
-    for _ in range(12):
-        observations, reward, *_ = envs.step(np.stack([forward, forward]))
-        history.append(observations)
-        rewards.append(reward)
-    for world in range(2):
-        np.testing.assert_array_equal(push.reset(seed=5 + world)[0], history[0][world])
-        for k in range(12):
-            observation, reward, *_ = push.step(forward)
-            np.testing.assert_array_equal(observation, history[k + 1][world])
-            assert np.float32(reward) == rewards[k][world]
 
 
 @pytest.mark.parametrize(

@@ -24,22 +24,11 @@ from softmode.envs.tasks.place_in_bin.task import BALL, TOY, Bin, bin_scene
 from softmode.errors import ConfigError, StateError
 from softmode.learning.config_values import config_of, values_of
 from softmode.objects import ObjectSet
-from tests.envs.test_object_sets import CUBE, KINDS, MATERIALS, PLACE, ROD, actions
+from tests.envs.object_kinds import CUBE, KINDS, MATERIALS, PLACE, ROD, actions, lift, lift_alone
 
 SLOTS = 4
 SET = ObjectSet(KINDS, materials=MATERIALS, resample=True, per_world=(1, SLOTS))
 NONE = [-1] * (SLOTS - 1)
-
-
-def lift(**changes: Any) -> LiftSoftConfig:
-    """Return LiftSoft with several objects, every one of its own material."""
-    return LiftSoftConfig(**{"objects": SET, "youngs_modulus_range": None, "image_size": 48, **changes})
-
-
-def alone(config: Any, k: int) -> Any:
-    """Return a configuration of object k alone."""
-    scene = replace(config.scene, object=KINDS[k], material=MATERIALS[k])
-    return replace(config, objects=None, scene=scene)
 
 
 def others(env: Any, name: str) -> np.ndarray:
@@ -49,14 +38,14 @@ def others(env: Any, name: str) -> np.ndarray:
 
 def test_absent_objects_are_inert() -> None:
     """With one of four objects there a world has the bits of the scene of that object, and its picture."""
-    config = lift(image_outputs=("segmentation",))
+    config = lift(SET, image_outputs=("segmentation",))
     env = LiftSoftEnv(config=config, obs_type="pixels", device="cpu")
     graph, place = env.task.graph, {**PLACE, "yaw": 0.3, "goal": (0.45, 0.0, 0.15)}
     for k in (1, 0):
         env.reset(seed=1, options={"object": [k, 2, 0, 1]})  # all there before, and moved
         for step in range(4):
             env.step(actions(1, step)[0])
-        single = LiftSoftEnv(config=alone(config, k), obs_type="pixels", device="cpu")
+        single = lift_alone(k)
         _, info = env.reset(seed=1, options={**place, "object": [k, *NONE]})
         assert info["object"].tolist() == [k, *NONE] and info["object_name"] == (SET.names[k],)
         single.reset(seed=1, options=place)
@@ -80,7 +69,7 @@ def test_absent_objects_are_inert() -> None:
 
 def test_labels_of_those_that_are_there() -> None:
     """A picture shows as many objects as there are, by their labels; the marker is the last."""
-    env = LiftSoftEnv(config=lift(image_outputs=("segmentation",), image_size=96), obs_type="pixels", device="cpu")
+    env = LiftSoftEnv(config=lift(SET, image_outputs=("segmentation",), image_size=96), obs_type="pixels", device="cpu")
     labels = env.task.scene.cameras[96, 96].labels
     names = [labels.index(f"splats/{slot}") for slot in range(SLOTS)]
     for objects in ([0, 1, -1, -1], [2, 2, 1, 0], [0, -1, -1, -1]):
@@ -91,7 +80,7 @@ def test_labels_of_those_that_are_there() -> None:
 
 def test_worlds_are_the_single_environment() -> None:
     """World i draws number, objects and places of the single environment with its seed, and has its bits."""
-    config = lift(objects_one_hot=True)
+    config = lift(SET, objects_one_hot=True)
     many = LiftSoftVectorEnv(3, config=config, device="cpu", max_episode_steps=4, autoreset_mode="SameStep")
     first, infos = many.reset(seed=11)
     rows, moves = [infos["object"].copy()], []
@@ -122,7 +111,7 @@ def test_worlds_are_the_single_environment() -> None:
 def test_numbers_are_drawn_equally_often() -> None:
     """Every number from the least to the most comes as often, and objects fill the first slots."""
     objects = replace(SET, per_world=(2, SLOTS))
-    env = LiftSoftVectorEnv(6, config=lift(objects=objects), device="cpu")
+    env = LiftSoftVectorEnv(6, config=lift(objects), device="cpu")
     counts = np.zeros(SLOTS + 1)
     for seed in range(30):
         _, infos = env.reset(seed=6 * seed)
@@ -173,7 +162,7 @@ def test_objects_touch_each_other() -> None:
 
 def test_state_brings_number_and_objects() -> None:
     """A state taken with three objects goes on with the same bits in a world that had one, and as bytes."""
-    env = LiftSoftVectorEnv(2, config=lift(), device="cpu")
+    env = LiftSoftVectorEnv(2, config=lift(SET), device="cpu")
     env.reset(seed=3, options={**PLACE, "object": [[0, 1, 2, -1], [1, -1, -1, -1]]})
     for step in range(8, 14):
         env.step(actions(2, step))
@@ -186,14 +175,14 @@ def test_state_brings_number_and_objects() -> None:
         observation, *_, infos = env.step(actions(2, step))
         np.testing.assert_array_equal(observation, row)
     assert infos["object"].tolist() == [[0, 1, 2, -1], [1, -1, -1, -1]]
-    fewer = LiftSoftVectorEnv(2, config=lift(objects=replace(SET, per_world=(1, 2))), device="cpu")
+    fewer = LiftSoftVectorEnv(2, config=lift(replace(SET, per_world=(1, 2))), device="cpu")
     with pytest.raises(StateError):
         fewer.set_state(kept)
 
 
 def test_distractors_are_not_the_object() -> None:
     """Fingers that hold another object have not grasped the one of the task."""
-    env = LiftSoftEnv(config=lift(), device="cpu")
+    env = LiftSoftEnv(config=lift(SET), device="cpu")
     place = {"position": (0.45, 0.1), "others_turn": 0.0, "other_place_1": (-np.pi / 2, 0.1), "other_yaw_1": 0.0}
     env.reset(seed=0, options={**place, "object": [0, 0, -1, -1]})
     felt = 0.0
@@ -268,7 +257,7 @@ def bin_of(toys: Any, **number: Any) -> PlaceInBinConfig:
 
 def test_configuration_is_kept_in_files() -> None:
     """Training files hold the number of objects."""
-    config = lift()
+    config = lift(SET)
     assert config_of(LiftSoftConfig, values_of(config)).objects.per_world == (1, SLOTS)
 
 
@@ -282,7 +271,7 @@ def test_what_cannot_be_says_so() -> None:
     with pytest.raises(ConfigError, match="one object per world"):
         PressSoftEnv(config=PressSoftConfig(objects=SET), device="cpu")
     with pytest.raises(ConfigError, match="do not fit on the table"):
-        LiftSoftEnv(config=lift(objects=replace(SET, per_world=8), others_clearance=0.2), device="cpu")
+        LiftSoftEnv(config=lift(replace(SET, per_world=8), others_clearance=0.2), device="cpu")
     with pytest.raises(ConfigError, match="others exclude each other"):
         PlaceInBinEnv(config=replace(bin_of((TOY,), per_world=2), scene=bin_scene()), device="cpu")
     with pytest.raises(ConfigError, match="do not fit within"):
@@ -290,7 +279,7 @@ def test_what_cannot_be_says_so() -> None:
     small = replace(bin_of((TOY,), per_world=4), bin=Bin(inner=(0.06, 0.06)))
     with pytest.raises(ConfigError, match="do not fit a bin"):
         PlaceInBinEnv(config=small, device="cpu")
-    env = LiftSoftEnv(config=lift(), device="cpu")
+    env = LiftSoftEnv(config=lift(SET), device="cpu")
     for wrong in ([-1, 0, -1, -1], [0, 3, -1, -1], [0, 1]):
         with pytest.raises(ConfigError, match="object"):
             env.reset(options={"object": wrong})

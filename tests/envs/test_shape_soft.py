@@ -13,7 +13,6 @@ import warp as wp
 import softmode  # noqa: F401  (registers the environments)
 from softmode.envs.scripted import scripted_policy
 from softmode.envs.tasks.shape_soft.config import POST, ShapeSoftConfig, shape_scene
-from softmode.envs.tasks.shape_soft.scripted import ScriptedShape
 from softmode.envs.tasks.shape_soft.targets import record_press
 from softmode.envs.tasks.shape_soft.task import ShapeSoftEnv, ShapeSoftVectorEnv
 from softmode.errors import ConfigError
@@ -28,9 +27,9 @@ IDLE = np.array([0.0, 0.0, 0.0, 0.0, 2.0 * 0.08 / 0.09 - 1.0], np.float32)
 
 
 @pytest.fixture(scope="module")
-def shape() -> ShapeSoftEnv:
+def shape(make_env: MakeEnv) -> ShapeSoftEnv:
     """Return the default environment."""
-    env = gym.make(ENV_ID).unwrapped
+    env = make_env("ShapeSoft").unwrapped
     assert isinstance(env, ShapeSoftEnv)
     return env
 
@@ -62,11 +61,11 @@ def play(env: ShapeSoftEnv, seed: int, **options: Any) -> dict[str, Any]:
 # -- goals ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("obs_type", ["pixels", "pixels_agent_pos"])
-def test_pictures_have_no_goals(obs_type: str) -> None:
+@pytest.mark.parametrize("obs_type", ["pixels_agent_pos", pytest.param("pixels", marks=pytest.mark.rest)])
+def test_pictures_have_no_goals(make_env: MakeEnv, obs_type: str) -> None:
     """Stable-Baselines3's checker takes an environment of pictures for what it is: one without goals."""
     checker = pytest.importorskip("stable_baselines3.common.env_checker")
-    env = gym.make(ENV_ID, obs_type=obs_type).unwrapped
+    env = make_env("ShapeSoft", obs_type).unwrapped
     checker.check_env(env, warn=True, skip_render_check=True)
     assert not hasattr(env, "compute_reward")
 
@@ -135,6 +134,7 @@ def test_a_press_that_cannot_reach_is_refused(shape: ShapeSoftEnv) -> None:
 def test_reward_is_the_sum_of_its_terms(shape: ShapeSoftEnv) -> None:
     """1 - tanh(e / L) + [e <= tolerance], e the rms distance of the points."""
     shape.reset(seed=1)
+    shape.action_space.seed(1)
     config = shape.config
     for _ in range(5):
         observation, reward, _, _, info = shape.step(shape.action_space.sample())
@@ -187,10 +187,16 @@ def test_success_takes_holding_still(shape: ShapeSoftEnv) -> None:
         assert (won.index(True) == shape.config.hold_steps - 1) if expected else not any(won)
 
 
-def test_log_mass_is_the_distance_of_masses(shape: ShapeSoftEnv) -> None:
+@pytest.fixture(scope="module")
+def square() -> ShapeSoftEnv:
+    """Return an environment of masses, whose targets a square post made, with the round one at the table."""
+    made = replace(POST, shape="box", extents=(0.024, 0.024, 0.12))
+    return ShapeSoftEnv(config=ShapeSoftConfig(reward="log_mass", goal_object=made))
+
+
+def test_log_mass_is_the_distance_of_masses(shape: ShapeSoftEnv, square: ShapeSoftEnv) -> None:
     """The error is sqrt(L / L_0) of MassLoss on a grid through the foot, L_0 that of nothing; order does not matter."""
-    config = ShapeSoftConfig(reward="log_mass")
-    env = ShapeSoftEnv(config=config)
+    env, config = square, square.config
     observation, info = env.reset(seed=2)
     random = np.random.default_rng(1)
     achieved, desired = points(observation["achieved_goal"]), points(observation["desired_goal"])
@@ -211,10 +217,9 @@ def test_log_mass_is_the_distance_of_masses(shape: ShapeSoftEnv) -> None:
     assert env.compute_reward(random.permutation(desired).ravel(), desired.ravel()) == pytest.approx(2.0, abs=1e-3)
 
 
-def test_the_goal_is_another_body() -> None:
+def test_the_goal_is_another_body(square: ShapeSoftEnv) -> None:
     """A round post is bent like a square one, which made the targets; every reward is that of its goals."""
-    square = replace(POST, shape="box", extents=(0.024, 0.024, 0.12))
-    env = ShapeSoftEnv(config=ShapeSoftConfig(reward="log_mass", goal_object=square))
+    env = square
     given = {"position": (0.45, 0.0), "yaw": 0.0}
     observation, info = env.reset(seed=0, options={**given, "goal": (0.0, 0.0)})
     low = points(observation["desired_goal"])
@@ -264,17 +269,12 @@ def test_script_succeeds_on_twenty_of_twenty_seeds(soft_env: MakeEnv, episode: E
     assert_success(episode(soft_env("softmode/ShapeSoft-v0")))
 
 
-def test_script_needs_its_own_environment() -> None:
-    """Another environment is refused."""
-    with pytest.raises(ConfigError, match="ShapeSoft"):
-        ScriptedShape(gym.make("CartPole-v1"))
-
-
 # -- worlds and pictures ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.rest
 def test_worlds_equal_single_environments(shape: ShapeSoftEnv) -> None:
-    """World i of two plays bitwise what the single environment plays; rewards of all worlds are computed at once."""
+    """World i of two plays bitwise what the single environment plays, as in every task; their rewards come at once."""
     envs = gym.make_vec(ENV_ID, num_envs=2).unwrapped
     assert isinstance(envs, ShapeSoftVectorEnv)
     observations, _ = envs.reset(seed=5)

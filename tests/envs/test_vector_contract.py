@@ -1,12 +1,13 @@
 """The API contract of every registered environment: single, vector, in worker processes, and one against the other.
 
-Each task gets the checks that single environments need and one combination of output and autoreset mode; the slow tier
-runs all combinations.
+Every task is checked once, in one kind of observation, and its worlds once, in one combination of output and autoreset
+mode. `make test-rest` and the slow tier have the other kinds and combinations.
 """
 
 from __future__ import annotations
 
 import functools
+import multiprocessing
 import pickle
 import warnings
 from collections.abc import Callable, Iterator
@@ -23,33 +24,33 @@ import softmode
 from softmode.envs import check_vector_env
 from softmode.envs.check import RULES, VALUES
 from softmode.envs.check.values import as_numpy, equal
+from softmode.envs.tasks.lift_soft.task import LiftSoftEnv
+from tests.envs.conftest import MakeEnv
 
 TASKS = list(softmode.ENVIRONMENTS)
+OBSERVED = {"LiftSoft": "pixels_agent_pos", "PushSoft": "pixels"}
+"""What the checked environment of a task returns, if not its state."""
 COMBINATIONS = [(mode, output) for output in ("numpy", "torch") for mode in AutoresetMode]
 LIMIT = 4
 """Control steps of an episode."""
 
-each_task = pytest.mark.parametrize("task", TASKS)
-
 
 def name_of(value: Any) -> str:
-    """Name a parameter."""
-    return value.name if isinstance(value, AutoresetMode) else str(value).removeprefix("softmode/")
+    """Name a parameter; an id by its task."""
+    return value.name if isinstance(value, AutoresetMode) else str(value).removeprefix("softmode/").removesuffix("-v0")
 
 
-@pytest.fixture(scope="module")
-def single() -> Iterator[Callable[[str], gym.Env]]:
-    """Return a function from a task to its environment, made once."""
-    made = []
-
-    @functools.cache
-    def make(task: str) -> gym.Env:
-        made.append(gym.make(task, render_mode="rgb_array"))
-        return made[-1]
-
-    yield make
-    for env in made:
-        env.close()
+each_task = pytest.mark.parametrize("task", TASKS, ids=name_of)
+each_task_observed = pytest.mark.parametrize(
+    ("task", "obs_type"),
+    [
+        *((name, OBSERVED.get(name, "state")) for name in map(name_of, TASKS)),
+        *(
+            pytest.param(*other, marks=pytest.mark.rest)
+            for other in (("LiftSoft", "state"), ("LiftSoft", "pixels"), ("PushSoft", "state"))
+        ),
+    ],
+)
 
 
 @pytest.fixture(scope="module")
@@ -73,28 +74,34 @@ def vector() -> Iterator[Callable[[str], gym.vector.VectorEnv]]:
 # -- single -----------------------------------------------------------------------------------------------------------
 
 
-@each_task
-def test_gymnasium_checker(single: Callable[[str], gym.Env], task: str) -> None:
-    """`gymnasium.utils.env_checker.check_env` has nothing to say, and warns of nothing."""
+@each_task_observed
+def test_gymnasium_checker(make_env: MakeEnv, task: str, obs_type: str) -> None:
+    """`gymnasium.utils.env_checker.check_env` has nothing to say, and warns of nothing.
+
+    To render, and to close, it makes other environments; all tasks render and close alike, so once will do.
+    """
+    again = task != "PressSoft"
     with warnings.catch_warnings():
-        warnings.simplefilter("error", UserWarning)  # Gymnasium's
-        check_env(single(task).unwrapped, skip_render_check=True)
+        warnings.simplefilter("error")
+        check_env(make_env(task, obs_type).unwrapped, skip_render_check=again, skip_close_check=again)
 
 
-@each_task
-def test_stable_baselines_checker(single: Callable[[str], gym.Env], task: str) -> None:
-    """So has that of Stable-Baselines3, goal environments and `compute_reward` included."""
+@each_task_observed
+def test_stable_baselines_checker(make_env: MakeEnv, task: str, obs_type: str) -> None:
+    """Neither has that of Stable-Baselines3, goal environments and `compute_reward` included."""
     checker = pytest.importorskip("stable_baselines3.common.env_checker")
-    checker.check_env(single(task).unwrapped, warn=True, skip_render_check=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        checker.check_env(make_env(task, obs_type).unwrapped, warn=True, skip_render_check=obs_type == "state")
 
 
 @each_task
-def test_spec_and_pickle(single: Callable[[str], gym.Env], task: str) -> None:
+def test_spec_and_pickle(make_env: MakeEnv, task: str) -> None:
     """Both entry points and a time limit are registered, and the single environment travels as what it is made from."""
     spec = gym.spec(task)
     assert spec.entry_point and spec.vector_entry_point and spec.max_episode_steps
     assert not spec.additional_wrappers and not spec.nondeterministic
-    pickled = pickle.dumps(single(task).unwrapped)
+    pickled = pickle.dumps(make_env(name_of(task)).unwrapped)
     assert len(pickled) < 20_000
 
 
@@ -148,19 +155,20 @@ def test_vector_checker_in_processes(task: str) -> None:
 
 
 @each_task
-def test_world_0_is_the_single_environment(
-    single: Callable[[str], gym.Env], vector: Callable[[str], gym.vector.VectorEnv], task: str
+def test_the_last_world_is_the_single_environment(
+    make_env: MakeEnv, vector: Callable[[str], gym.vector.VectorEnv], task: str
 ) -> None:
-    """`check_environments_match` finds the same spaces, bits and infos in the first of two worlds.
+    """`check_environments_match` finds the same spaces, bits and infos in the second of two worlds.
 
     The single environment's infos hold all that the vector's do, the solver's flags by name too.
     """
     steps = LIMIT - 1  # an episode that ends would go on in the vector
-    check_environments_match(FirstWorld(vector(task)), single(task), num_steps=steps, info_comparison="superset")
+    worlds, single = LastWorld(vector(task)), make_env(name_of(task))
+    check_environments_match(worlds, single, num_steps=steps, info_comparison="superset")
 
 
-class FirstWorld(gym.Env):
-    """World 0 of a vector environment as a single one; the others get the same actions."""
+class LastWorld(gym.Env):
+    """The last world of a vector environment as a single one; the others draw other episodes, and get other actions."""
 
     def __init__(self, env: gym.vector.VectorEnv) -> None:
         """Take over the spaces of one world."""
@@ -169,21 +177,23 @@ class FirstWorld(gym.Env):
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
         """Reset."""
-        return first(as_numpy(self.env.reset(seed=seed, options=options)))
+        seeds = None if seed is None else [seed + k for k in reversed(range(self.env.num_envs))]
+        return one(as_numpy(self.env.reset(seed=seeds, options=options)))
 
     def step(self, action: Any) -> Any:
         """Step."""
-        return first(as_numpy(self.env.step(np.tile(action, (self.env.num_envs, 1)))))
+        signs = np.where(np.arange(self.env.num_envs) == self.env.num_envs - 1, 1.0, -1.0)
+        return one(as_numpy(self.env.step((signs[:, None] * action).astype(np.float32))))
 
 
-def first(tree: Any) -> Any:
-    """Return world 0 of a tree of arrays, without masks and ends of episodes, numbers as Python's own."""
+def one(tree: Any, world: int = -1) -> Any:
+    """Return a world of a tree of arrays, without masks and ends of episodes, numbers as Python's own."""
     if isinstance(tree, tuple):
-        return tuple(map(first, tree))
+        return tuple(one(part, world) for part in tree)
     if isinstance(tree, dict):
         keys = [key for key in tree if not (key.startswith("_") and key[1:] in tree)]
-        return {key: first(tree[key]) for key in keys if key not in ("final_obs", "final_info")}
-    return tree[0].item() if tree.ndim == 1 and tree.dtype != object else tree[0]
+        return {key: one(tree[key], world) for key in keys if key not in ("final_obs", "final_info")}
+    return tree[world].item() if tree.ndim == 1 and tree.dtype != object else tree[world]
 
 
 def stacked(observations: Any) -> Any:
@@ -211,7 +221,7 @@ def test_the_end_is_the_same_in_both_autoreset_modes(task: str) -> None:
     assert ours[3].all()
     assert equal(stacked(ours[4]["final_obs"]), theirs[0])
     assert equal(ours[4]["final_info"], theirs[4])
-    fresh = [ours[4]["end_reason"], *(ours[4]["reward_terms"][name] for name in first(theirs[4]["reward_terms"]))]
+    fresh = [ours[4]["end_reason"], *(ours[4]["reward_terms"][name] for name in one(theirs[4]["reward_terms"]))]
     assert not np.any(fresh)  # beside final_info are the infos of the new episodes
     assert equal(ours[0], then.step(action)[0])
     action = same.action_space.sample()
@@ -221,25 +231,32 @@ def test_the_end_is_the_same_in_both_autoreset_modes(task: str) -> None:
 # -- worker processes -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("context", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("task", TASKS[:1])
-def test_worker_processes(single: Callable[[str], gym.Env], task: str, context: str) -> None:
-    """`AsyncVectorEnv` over the single environment gives the bits of the environment in this process."""
-    workers = AsyncVectorEnv([functools.partial(made, task)], context=context)
+@pytest.mark.parametrize(
+    ("context", "task", "obs_type"),
+    [
+        ("fork", "LiftSoft", "state"),
+        ("forkserver", "PushSoft", "pixels"),
+        pytest.param("spawn", "LiftSoft", "state", marks=pytest.mark.slow),
+    ],
+)
+def test_worker_processes(make_env: MakeEnv, context: str, task: str, obs_type: str) -> None:
+    """`AsyncVectorEnv` over the single environment gives the bits of the environment in this process, which has played.
+
+    "forkserver" and "spawn" start a fresh process, which has other hashes and addresses; the first from one that has
+    imported the simulator and does not initialise it, since Warp's threads survive no fork.
+    """
+    multiprocessing.set_forkserver_preload(["mujoco_warp", LiftSoftEnv.__module__])
+    single = make_env(task, obs_type)
+    # "softmode:" imports the package, which a spawned process has not.
+    factory = functools.partial(gym.make, f"softmode:softmode/{task}-v0", obs_type=obs_type)
+    workers = AsyncVectorEnv([factory], context=context)
     try:
-        np.testing.assert_array_equal(workers.reset(seed=3)[0][0], single(task).reset(seed=3)[0])
+        assert equal(one(workers.reset(seed=3)[0]), single.reset(seed=3)[0])
         workers.action_space.seed(0)
-        for _ in range(4):
+        for _ in range(8):
             action = workers.action_space.sample()
-            theirs, ours = workers.step(action), single(task).step(action[0])
-            np.testing.assert_array_equal(theirs[0][0], ours[0])
+            theirs, ours = workers.step(action), single.step(action[0])
+            assert equal(one(theirs[0]), ours[0])
             assert theirs[1][0] == ours[1]
     finally:
         workers.close()
-
-
-def made(task: str) -> gym.Env:
-    """Make an environment in a worker."""
-    import softmode  # noqa: F401  (a spawned process has registered nothing)
-
-    return gym.make(task)

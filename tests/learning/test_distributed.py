@@ -7,9 +7,10 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pytest
 
 from softmode.learning.hyperparameters import Hyperparameters
 from softmode.learning.spaces import Interface
@@ -21,37 +22,32 @@ if TYPE_CHECKING:
 pytestmark = needs("torch")
 
 ROOT = Path(__file__).resolve().parents[2]
-TRAIN = """
-import sys
-from pathlib import Path
-import numpy as np
-from softmode.learning import trainer
-from tests.learning.test_runs import run
-folder, ranks = Path(sys.argv[1]), {}
-finish = trainer._Run.finish
-def keep(self):
-    ranks["own"], ranks["value"] = self.ranks, self.ppo.optimizer.value.numpy()
-    ranks["moments"] = self.model.actor.encoder.moments["state"].mean.numpy()
-    ranks["seen"] = self.collector.observation["state"].numpy()
-    return finish(self)
-trainer._Run.finish = keep
-result = run(folder / "run", 2048)
-rank = ranks.pop("own").rank
-np.savez(folder / f"rank{rank}.npz", steps=result.env_steps, **ranks)
-"""
-UPDATE = """
+CODE = """
 import sys
 from pathlib import Path
 import numpy as np, torch
+from softmode.learning import trainer
 from softmode.learning.distributed import Ranks
 from tests.learning.test_distributed import updated
+from tests.learning.test_runs import run
+folder = Path(sys.argv[1])
 ranks = Ranks.start(torch.device("cpu"))
-np.save(Path(sys.argv[1]) / f"rank{ranks.rank}.npy", updated(ranks))
+rank, found = ranks.rank, {"updated": updated(ranks)}
 ranks.stop()
+finish = trainer._Run.finish
+def keep(self):
+    found["value"] = self.ppo.optimizer.value.numpy()
+    found["moments"] = self.model.actor.encoder.moments["state"].mean.numpy()
+    found["seen"] = self.collector.observation["state"].numpy()
+    return finish(self)
+trainer._Run.finish = keep
+result = run(folder / "run", 2048)
+np.savez(folder / f"rank{rank}.npz", steps=result.env_steps, **found)
 """
+"""What each process does: an update of its share, then training of its worlds."""
 
 
-def torchrun(code: str, folder: Path, processes: int = 2) -> None:
+def torchrun(folder: Path, processes: int = 2) -> None:
     """Run the code in processes that know of each other as torchrun's do."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -60,7 +56,7 @@ def torchrun(code: str, folder: Path, processes: int = 2) -> None:
     environment |= {"MASTER_PORT": port, "WORLD_SIZE": str(processes)}
     started = [
         subprocess.Popen(
-            [sys.executable, "-c", code, str(folder)],
+            [sys.executable, "-c", CODE, str(folder)],
             env={**environment, "RANK": str(rank), "LOCAL_RANK": str(rank)},
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
@@ -103,14 +99,27 @@ def updated(ranks: Ranks) -> np.ndarray:
     return ppo.optimizer.value.numpy().copy()
 
 
-def test_two_processes_stay_equal(tmp_path: Path):
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return where two processes have left what they hold."""
+    made = tmp_path_factory.mktemp("ranks")
+    torchrun(made)
+    return made
+
+
+@pytest.fixture
+def ranks(folder: Path) -> list[Any]:
+    """Return what each of the two processes holds."""
+    return [np.load(folder / f"rank{rank}.npz") for rank in range(2)]
+
+
+def test_two_processes_stay_equal(folder: Path, ranks: list[Any]):
     """After training both hold the same bits, from worlds of their own; steps count those of both."""
-    torchrun(TRAIN, tmp_path)
-    first, second = (np.load(tmp_path / f"rank{rank}.npz") for rank in range(2))
+    first, second = ranks
     assert np.array_equal(first["value"], second["value"]) and np.array_equal(first["moments"], second["moments"])
     assert not np.array_equal(first["seen"], second["seen"])
     assert int(first["steps"]) == int(second["steps"]) == 2048
-    assert {path.name for path in (tmp_path / "run").iterdir()} == {
+    assert {path.name for path in (folder / "run").iterdir()} == {
         "config.json",
         "progress.csv",
         "latest.npz",
@@ -118,12 +127,11 @@ def test_two_processes_stay_equal(tmp_path: Path):
     }
 
 
-def test_two_processes_update_as_one_with_all_worlds(tmp_path: Path):
+def test_two_processes_update_as_one_with_all_worlds(ranks: list[Any]):
     """One update of two halves equals that of the whole up to rounding: scales, advantages, gradients, divergence."""
     from softmode.learning.distributed import Ranks
 
-    torchrun(UPDATE, tmp_path)
-    first, second = (np.load(tmp_path / f"rank{rank}.npy") for rank in range(2))
+    first, second = (rank["updated"] for rank in ranks)
     assert np.array_equal(first, second)
     alone = updated(Ranks())
     # Adam's first step is the learning rate times the sign of the gradient, whose rounding errs by 1e-6 at most.

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from softmode.cli.main import main
 from softmode.errors import CheckpointError, ConfigError, RunError, TrainingDiverged
 from softmode.learning.checkpoints import read_checkpoint
 from softmode.learning.hyperparameters import Hyperparameters
@@ -125,14 +126,7 @@ def test_a_killed_run_goes_on(tmp_path: Path):
             process.stdout.close()
     reached = read_checkpoint(folder / "latest.npz").progress["env_steps"]
     assert reached >= 19 * 64
-    done = subprocess.run(
-        [*command, "--total-steps", str(reached + 640), "--resume"],
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
+    assert main([*command[3:], "--total-steps", str(reached + 640), "--resume"]) == 0
     assert read_checkpoint(folder / "latest.npz").progress["env_steps"] == reached + 640
     steps = [int(row["env_steps"]) for row in rows(folder)]
     assert steps == list(range(64, reached + 641, 64))
