@@ -17,13 +17,14 @@ import pytest
 
 from softmode.cli.main import main
 from softmode.errors import ConfigError, MissingExtraError
+from softmode.objects import load, write_object
 from softmode.view.app import ViewApp, ViewOptions
 from softmode.view.gaussians import GaussianBuffer
 from softmode.view.live_types import SplatPicture
 from softmode.view.session import LiveSession
 from tests.needs import needs
 from tests.view.page_client import PageClient
-from tests.view.serving import Served, served
+from tests.view.serving import SAUSAGE, Served, served
 
 pytestmark = needs("viser")
 
@@ -35,6 +36,14 @@ def view(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     """Serve a hanging sausage."""
     with served(record_folder=tmp_path_factory.mktemp("recordings")) as one:
         yield one
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Save the sausage, which a command then shows without building anything."""
+    file, thing = tmp_path_factory.mktemp("saved") / "toy.npz", load(SAUSAGE)
+    write_object(file, thing.body, thing.visible_splats)
+    return str(file)
 
 
 def camera_message(eye: np.ndarray) -> dict[str, Any]:
@@ -325,12 +334,9 @@ def test_without_viser_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> No
         ViewOptions(port=0).check()
 
 
-def test_the_command_serves_for_a_while(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_the_command_serves_for_a_while(saved: str, capfd: pytest.CaptureFixture[str]) -> None:
     """`softmode view FILE --duration` says where to look, warns about other addresses, and ends by itself."""
-    from softmode.splats import make_plush, write_ply
-
-    write_ply(tmp_path / "toy.ply", make_plush(count=600))
-    arguments = ["view", str(tmp_path / "toy.ply"), "--size", "0.1", "--port", "0", "--no-open", "--duration", "0.5"]
+    arguments = ["view", saved, "--port", "0", "--no-open", "--duration", "0.5"]
     assert main(arguments) == 0
     said = capfd.readouterr()
     assert "http://127.0.0.1:" in said.out and "warning" not in said.err and "viser" not in said.out
@@ -339,7 +345,7 @@ def test_the_command_serves_for_a_while(tmp_path: Path, capfd: pytest.CaptureFix
 
 
 def test_a_recording_is_kept_when_the_command_ends(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    saved: str, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What was being recorded is written, not thrown away."""
     enter = ViewApp.__enter__
@@ -350,16 +356,16 @@ def test_a_recording_is_kept_when_the_command_ends(
 
     monkeypatch.setattr(ViewApp, "__enter__", press_record)
     folder = tmp_path / "röm 1"
-    assert main(["view", "--port", "0", "--no-open", "--duration", "1", "--record-folder", str(folder)]) == 0
+    assert main(["view", saved, "--port", "0", "--no-open", "--duration", "1", "--record-folder", str(folder)]) == 0
     (film,) = folder.glob("*.mp4")
     assert film.stat().st_size > 1000 and str(film) in capfd.readouterr().out
 
 
-def test_an_interrupted_command_ends_cleanly() -> None:
+def test_an_interrupted_command_ends_cleanly(saved: str) -> None:
     """Ctrl-C while it serves: exit code 0, one line, no traceback."""
     program = (
         "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # the background ignores it
-        "from softmode.cli.main import main; sys.exit(main(['view', '--port', '0', '--no-open']))"
+        f"from softmode.cli.main import main; sys.exit(main(['view', {saved!r}, '--port', '0', '--no-open']))"
     )
     process = subprocess.Popen(
         [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True

@@ -274,15 +274,8 @@ def test_a_wild_drag_stays_finite(hanging):
 # -- pins -------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("hold", "youngs_modulus"),
-    [
-        ("top", 2.0e3),
-        ("base", 1.0e7),
-        pytest.param("top", 1.0e7, marks=pytest.mark.rest),
-        pytest.param("base", 2.0e3, marks=pytest.mark.rest),
-    ],
-)
+@pytest.mark.parametrize("hold", ["top", "base"])
+@pytest.mark.parametrize("youngs_modulus", [2.0e3, 1.0e7])
 def test_what_hangs_is_held(hold, youngs_modulus):
     """The held region stays within 1 % of the size under gravity, soft or stiff."""
     live = session(hold=hold, material=Material(youngs_modulus=youngs_modulus, density=1000.0, viscosity=0.01))
