@@ -381,7 +381,7 @@ def test_play_lifts_a_body(assets: Path, tmp_path: Path, capsys: pytest.CaptureF
 
 
 def test_cut_writes_the_parts(assets: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A mesh and a saved body are cut at heights over the ground; volumes add up, a plane beside changes nothing and says so."""
+    """A mesh and a saved body are cut at heights over the ground; volumes add up, a plane beside says so."""
     whole = tmp_path / "box.npz"
     assert main(["body", "build", str(assets / "box.obj"), *QUICK, "-o", str(whole)]) == 0
     height = 0.04 * 0.08 / 0.05
