@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import shlex
 import signal
 import subprocess
@@ -131,45 +132,48 @@ def pressed(url: str, label: str, last: str | None = None) -> list[str]:
     raise TimeoutError(f"no button {label!r} at {url}")
 
 
-@contextlib.contextmanager
-def viewed(*words: str, **pipes: int) -> Iterator[tuple[subprocess.Popen[str], int]]:
-    """Run `softmode view` at a free port, which is returned too."""
-    port = _free_port("127.0.0.1", 0)
-    with subprocess.Popen(
-        [sys.executable, "-m", "softmode", "view", *words, "--port", str(port), "--no-open"],
-        text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a job in the background ignores it
-        **pipes,
-    ) as running:
-        try:
-            yield running, port
-        finally:
-            running.kill()  # a page that is still open would keep the test waiting for ever
-
-
 def test_a_running_page_is_prepared_by_its_button(capture: Path) -> None:
     """A page that shows a capture has a button for the gizmos, at the same address; theirs brings the object back."""
-    with viewed(str(capture), "--size", "0.08", "--up=+x", stdout=subprocess.PIPE) as (running, port):
-        for label in ("prepare", "build", "prepare"):
-            told = pressed(f"http://127.0.0.1:{port}", label)
-            # Chromium would not come back to a server that is gone for as long as a build takes.
-            assert any("building" in text for text in told) == (label == "build")
-        running.send_signal(signal.SIGINT)
-        said, _ = running.communicate(timeout=60.0)
+    port = _free_port("127.0.0.1", 0)
+    words = ["view", str(capture), "--size", "0.08", "--up=+x", "--port", str(port), "--no-open"]
+    with subprocess.Popen(
+        [sys.executable, "-m", "softmode", *words],
+        stdout=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a job in the background ignores it
+    ) as running:
+        try:
+            for label in ("prepare", "build", "prepare"):
+                told = pressed(f"http://127.0.0.1:{port}", label)
+                # Chromium would not come back to a server that is gone for as long as a build takes.
+                assert any("building" in text for text in told) == (label == "build")
+            running.send_signal(signal.SIGINT)
+            said, _ = running.communicate(timeout=60.0)
+        finally:
+            running.kill()  # a page that is still open would keep the test waiting for ever
     assert running.returncode in (0, 130)  # interrupted on the last page, or before it was up
     assert said.count(f"open http://127.0.0.1:{port}") >= 3  # the object, the gizmos, the object
     assert f"to do this again: softmode view {shlex.quote(str(capture))} --up=+x --port {port} --no-open" in said
     assert "--size 0.08" in said
 
 
-def test_a_box_without_splats_is_refused_on_the_page(capture: Path) -> None:
+def test_a_box_without_splats_is_refused_on_the_page(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """What cannot be built is said on the page, which goes on, and on the console."""
+    port, told = _free_port("127.0.0.1", 0), []
+
+    def visit() -> None:
+        try:
+            for _ in range(2):
+                told.append(pressed(f"http://127.0.0.1:{port}", "build", "no splat"))
+        finally:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
+    visitor = threading.Thread(target=visit)
+    visitor.start()
     crop = ["--crop", *"10 10 10 11 11 11".split()]
-    with viewed(str(capture), "--prepare", *crop, stderr=subprocess.PIPE) as (running, port):
-        for _ in range(2):
-            told = pressed(f"http://127.0.0.1:{port}", "build", "no splat")
-            assert any("lies inside crop" in text for text in told)
-        running.send_signal(signal.SIGINT)
-        _, said = running.communicate(timeout=60.0)
-    assert running.returncode == 0
-    assert said.count("no splat") == 2
+    assert main(["view", str(capture), "--prepare", *crop, "--port", str(port), "--no-open"]) == 0
+    visitor.join()
+    signal.signal(signal.SIGINT, before)
+    assert len(told) == 2 and all(any("lies inside crop" in text for text in texts) for texts in told)
+    assert capsys.readouterr().err.count("no splat") == 2
