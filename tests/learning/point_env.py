@@ -136,7 +136,8 @@ class PointVectorEnv(gym.vector.VectorEnv):
         }
         self.done = terminated | truncated
         if self.mode == AutoresetMode.SAME_STEP:
-            info = {**info, "final_obs": self._observe(), "_final_obs": self.done.clone(), "final_info": dict(info)}
+            last = {"final_obs": self._observe(), "_final_obs": self.done.clone(), "final_info": dict(info)}
+            info = {**info, **last, "is_success": info["is_success"] & ~self.done}  # what has just begun is no success
             self._start(self.done.clone())
         else:
             self._start(waiting)

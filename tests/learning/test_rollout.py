@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -151,16 +151,26 @@ def test_gymnasium_environments_bootstrap_too(mode: AutoresetMode):
     torch.testing.assert_close(advantage[8, 0], expected, rtol=0.0, atol=1e-4)
 
 
-def test_statistics_count_whole_episodes():
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+def test_statistics_count_whole_episodes(mode: AutoresetMode, monkeypatch: pytest.MonkeyPatch):
     """Sums of returns, lengths and successes equal those of a loop over worlds; reset steps do not count."""
     import torch
 
-    env = PointVectorEnv(5)
+    env, wins = PointVectorEnv(40, mode=mode, limit=7), []
+    step = env.step
+
+    def noted(actions: torch.Tensor) -> Any:
+        """Step, and note the successes of the episodes that end."""
+        *found, terminated, truncated, info = step(actions)
+        wins.append(int((info.get("final_info", info)["is_success"] & (terminated | truncated)).sum()))
+        return *found, terminated, truncated, info
+
+    monkeypatch.setattr(env, "step", noted)
     collect, _ = collector(env)
     rollout = collect.collect(torch.Generator().manual_seed(0))
     done = (rollout.terminated | rollout.truncated).numpy()
     returns, lengths = [], []
-    for i in range(5):
+    for i in range(40):
         total, length = 0.0, 0
         for t in range(rollout.steps):
             if rollout.valid[t, i]:
@@ -172,6 +182,7 @@ def test_statistics_count_whole_episodes():
     sums = collect.statistics.take().tolist()
     assert sums[0] == len(returns) and sums[2] == sum(lengths) and sums[4] == float(rollout.valid.sum())
     assert sums[1] == pytest.approx(sum(returns), rel=1e-5)
+    assert sums[3] == sum(wins) > 0
     assert sums[5] == pytest.approx(float(rollout.reward.sum()), rel=1e-5)
     assert collect.statistics.take().tolist() == [0.0] * 6
 
