@@ -88,6 +88,7 @@ def test_tries_again_after_a_loss(lift: LiftSoftEnv) -> None:
     assert info["is_success"]
 
 
+@pytest.mark.rest
 def test_lifts_a_trained_capture(playbot: Path) -> None:
     """A robot from a trained splat, which cannot stand on its pointed foot, is lifted from where it lies."""
     env = LiftSoftEnv(splat=playbot)

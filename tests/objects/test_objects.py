@@ -160,6 +160,7 @@ def test_affine_motion_of_body_moves_the_splats_along() -> None:
     np.testing.assert_allclose(X + thing.basis @ thing.body.affine(A, t), X @ A.T + t, atol=1e-9)
 
 
+@pytest.mark.rest
 def test_body_comes_from_the_cache_the_second_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A second load builds nothing and gives bitwise the same object; another size is another body."""
     monkeypatch.setenv("SOFTMODE_CACHE", str(tmp_path))

@@ -34,7 +34,7 @@ OBJECTS = {f"{name}, capture": name for name in ("thin neck", "mug", "ground ben
     f"{name}, preset": name for name in ("cable", "glove", "mug")
 }
 """Captures as they are filled, and presets at their own size."""
-DEAR = {"hand", "gyroid", "star, splats", "mug, capture", "ground beneath, capture"}
+DEAR = {"hand", "gyroid", "star, splats", "mug, capture", "thin neck, capture", "ground beneath, capture"}
 """Shapes that take more than two seconds each."""
 
 
