@@ -67,6 +67,7 @@ def test_play_films_an_episode(tmp_path: Path, capfd: pytest.CaptureFixture[str]
     assert "Module" not in out + err  # Warp's report on each module
 
 
+@pytest.mark.rest
 def test_play_films_a_room_as_a_gif(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], short: Callable[[int], None]
 ) -> None:
@@ -95,6 +96,7 @@ def test_play_lifts_a_trained_capture(capsys: pytest.CaptureFixture[str]) -> Non
     assert "success: True" in capsys.readouterr().out
 
 
+@pytest.mark.rest
 def test_play_lifts_an_inria_ply(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The plush, written as .ply in other units, is read, scaled and lifted."""
     file = tmp_path / "toy.ply"
@@ -264,7 +266,10 @@ def test_a_missing_extra_leaves_nothing(
     assert listing(tmp_path) == []
 
 
-@pytest.mark.parametrize(("failure", "code"), [(KeyboardInterrupt, 130), (OSError("No space left on device"), 2)])
+@pytest.mark.parametrize(
+    ("failure", "code"),
+    [(KeyboardInterrupt, 130), pytest.param(OSError("No space left on device"), 2, marks=pytest.mark.rest)],
+)
 def test_interrupted_film_leaves_the_old_one(
     failure: Any,
     code: int,

@@ -26,6 +26,7 @@ from softmode.objects.object_file import file_kind, read_object
 from softmode.splats import Splats, make_plush, write_ply
 from softmode.splats.point_cloud import splats_from_points
 from softmode.viz.body_picture import mode_frequencies
+from tests.marks import rest_but
 from tests.test_cli import listing
 
 QUICK = ["--modes", "2", "--kernels", "60", "--points", "48", "--surface", "120", "--splats", "400"]
@@ -75,7 +76,10 @@ def run(assets: Path, command: str, name: str, *more: str) -> int:
     return main(["body", command, str(assets / name), *QUICK, *up, *more])
 
 
-@pytest.mark.parametrize("name", ["plush.ply", "box.obj", "ring.glb", "cloud.npz", "points.ply"])
+@pytest.mark.parametrize(
+    "name",
+    rest_but(["box.obj", "ring.glb", "cloud.npz"], ["plush.ply", "box.obj", "ring.glb", "cloud.npz", "points.ply"]),
+)
 def test_build_writes_a_body_with_its_splats(
     name: str, assets: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -117,6 +121,7 @@ def test_check_names_the_defect(
     assert listing(assets) == before
 
 
+@pytest.mark.rest
 def test_a_crop_cures_the_floater(assets: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The remedy that is named works."""
     assert run(assets, "check", "floater.ply", "--crop", "-0.1", "-0.1", "-0.1", "0.1", "0.1", "0.2") == 0

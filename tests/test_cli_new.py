@@ -50,6 +50,7 @@ def test_it_reads_as_softmode_does(package: Path) -> None:
     run(package, "-m", "ruff", "format", "--check", "--config", str(ROOT / "pyproject.toml"), ".")
 
 
+@pytest.mark.rest
 def test_it_passes_its_own_tests(package: Path) -> None:
     """In its folder pytest passes: every test passes, none is skipped."""
     told = run(package, "-m", "pytest", "-q", "-p", "no:cacheprovider")

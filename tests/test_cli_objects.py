@@ -32,6 +32,7 @@ from softmode.objects.config import PAINTED, StifferBox
 from softmode.objects.fingerprint import file_fingerprint
 from softmode.objects.paint import StifferColor
 from softmode.splats import make_plush, write_ply
+from tests.marks import rest_but
 from tests.test_cli_body import QUICK, merged
 
 ID = "softmode/LiftSoft-v0"
@@ -94,7 +95,10 @@ LOADING = ("play", "view object", "body check")
 SAID = [(command, "object") for command in commands(Path())] + [(command, "splat") for command in LOADING]
 
 
-@pytest.mark.parametrize(("command", "given"), SAID)
+@pytest.mark.parametrize(
+    ("command", "given"),
+    rest_but({*SAID} - {("view object", "splat"), ("play", "splat"), ("view object", "object")}, SAID),
+)
 def test_every_command_takes_an_object_and_says_what_matters(
     command: str,
     given: str,
@@ -126,6 +130,7 @@ def test_check_hands_the_object_on(assets: Path, monkeypatch: pytest.MonkeyPatch
     assert scene.object.file == ("mesh", file) and (scene.object.size, scene.material.density) == (0.06, 200.0)
 
 
+@pytest.mark.rest
 def test_a_policy_finds_its_object_again(
     tmp_path: Path, short: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

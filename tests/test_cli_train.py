@@ -82,6 +82,7 @@ def test_mistakes_name_the_remedy(arguments, named, capsys, tmp_path, monkeypatc
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.rest
 def test_pixels_of_a_softmode_environment(tmp_path: Path, capsys):
     """The camera's picture size comes from JSON, the critic reads the state, and the policy makes its environment."""
     folder = tmp_path / "run"

@@ -77,6 +77,7 @@ def grasp(
     return {"aside": aside} | {name: array.numpy() for name, array in arrays.items()}
 
 
+@pytest.mark.rest
 def test_one_launch_equals_launches_per_phase() -> None:
     """On CPU a team is one thread and every sum has one order: equal to the bit, in a grasp."""
     apart, at_once = (grasp("cpu", one_launch=flag) for flag in (False, True))

@@ -131,6 +131,7 @@ def test_golden(soft_env, episode, golden):
 """
 
 
+@pytest.mark.rest
 def test_the_page_runs_and_failures_lie_beside_the_report(
     installed: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
 ) -> None:
