@@ -17,7 +17,7 @@ import pytest
 
 FILE = Path(__file__).with_suffix(".json")
 """Seconds by file and test function, of all cases together. Functions below `LEAST` are one entry of their file."""
-LEAST = 0.2
+LEAST = 0.5
 """Seconds below which a test function has no entry of its own."""
 REST = "others"
 """Name of the entry of all functions below `LEAST`."""

@@ -109,7 +109,8 @@ def test_detours_turn_and_scale_with_the_object() -> None:
     """An object that was laid down and enlarged after it was integrated has the same ways, and kernels, there."""
     quadrature = integrate(fork(), 2000)
     rotation = Rotation.from_rotvec([0.3, -0.7, 1.1]).as_matrix()
-    other = turned(scaled(quadrature, 2.5), rotation)
+    large = scaled(quadrature, 2.5)
+    other = turned(large, rotation, large.surface_points)
     centres = quadrature.points[::9]
     found = []
     for one, at, size in ((quadrature, centres, 1.0), (other, 2.5 * centres @ rotation.T, 2.5)):

@@ -72,7 +72,7 @@ def test_workflows_cover_what_is_promised() -> None:
     assert set(found) == {"tests", "newest", "docs", "release"}
     assert found["tests"]["jobs"]["test"]["strategy"]["matrix"]["python"] == ["3.11", "3.12", "3.13", "3.14"]
     run = {word for step in steps(found["tests"]) for word in targets(step.get("run", ""))}
-    assert run == {"lint", "test"}
+    assert run == {"lint", "test", "test-rest"}
     assert found["newest"][True]["schedule"] and found["newest"]["jobs"]["test"]["continue-on-error"] is True
     assert found["release"][True] == {"push": {"tags": ["v*"]}}
     for name in ("docs", "release"):  # the jobs that publish, and no others, get a token

@@ -16,7 +16,7 @@ from softmode.deformables import Material
 from softmode.deformables.build.quadrature_mesh import cap_holes
 from softmode.deformables.model.authoring import add_pins, add_reduced_body
 from softmode.errors import ConfigError
-from softmode.objects import ObjectConfig, SoftObject, load, loader, task_objects
+from softmode.objects import ObjectConfig, SoftObject, load, pipeline, task_objects
 from softmode.objects.primitives import checker, primitive_mesh, primitive_quadrature
 from softmode.splats import ColoredMesh
 from softmode.splats.splats import rotations_from_quats
@@ -139,7 +139,7 @@ def test_shape_comes_from_the_cache_the_second_time(tmp_path: Path, monkeypatch:
     """A second load builds nothing and gives the same object; other colours share the body, other samples do not."""
     monkeypatch.setenv("SOFTMODE_CACHE", str(tmp_path))
     first = load(task_objects.CUBE)
-    monkeypatch.setattr(loader, "build_body", lambda *_, **__: pytest.fail("built again"))
+    monkeypatch.setattr(pipeline, "build_body", lambda *_, **__: pytest.fail("built again"))
     second = load(task_objects.CUBE)
     np.testing.assert_array_equal(first.basis, second.basis)
     np.testing.assert_array_equal(first.splats.sh, second.splats.sh)
