@@ -7,6 +7,7 @@ and keep the second, in which no kernel is compiled and no body is built. Tests 
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections import defaultdict
 from collections.abc import Generator
@@ -37,7 +38,8 @@ def expected(nodeids: list[str], seconds: Seconds) -> dict[str, float]:
     for nodeid in nodeids:
         file, function = split(nodeid)
         wanted[file].add(function if function in seconds.get(file, {}) else REST)
-    return {file: sum(seconds.get(file, {}).get(name, 0.0) for name in names) for file, names in wanted.items()}
+    # fsum, as sums of a set's members come in another order in every process
+    return {file: math.fsum(seconds.get(file, {}).get(name, 0.0) for name in names) for file, names in wanted.items()}
 
 
 def split(nodeid: str) -> tuple[str, str]:
