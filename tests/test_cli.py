@@ -88,6 +88,7 @@ def test_play_films_a_room_as_a_gif(
     assert "Give --video" in capsys.readouterr().err
 
 
+@pytest.mark.rest
 def test_play_lifts_a_trained_capture(capsys: pytest.CaptureFixture[str]) -> None:
     """The scripted policy lifts the robot out of a trained SOG capture."""
     if not PLAYBOT.is_file():

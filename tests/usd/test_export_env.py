@@ -31,6 +31,7 @@ def short(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
     return limit
 
 
+@pytest.mark.rest
 def test_play_writes_a_stage(tmp_path: Path, capsys: pytest.CaptureFixture[str], short: Callable[[int], None]) -> None:
     """Every reset and step of all episodes is a frame at the control rate; the file is the only one."""
     short(3)

@@ -132,6 +132,7 @@ def pressed(url: str, label: str, last: str | None = None) -> list[str]:
     raise TimeoutError(f"no button {label!r} at {url}")
 
 
+@pytest.mark.rest
 def test_a_running_page_is_prepared_by_its_button(capture: Path) -> None:
     """A page that shows a capture has a button for the gizmos, at the same address; theirs brings the object back."""
     port = _free_port("127.0.0.1", 0)

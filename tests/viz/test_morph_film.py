@@ -121,6 +121,7 @@ def test_a_stage_holds_every_frame(scenes: list[MorphScene], tmp_path: Path) -> 
     assert not (tmp_path / "none.usdc").exists()
 
 
+@pytest.mark.rest
 def test_the_command_films_and_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """It writes film, contact sheet and run; a second call plans nothing again, and another morph is refused there."""
     pytest.importorskip("imageio_ffmpeg", reason="the extra demo is not installed")

@@ -412,6 +412,7 @@ def test_bad_input_is_refused(falling: Any, env: Any, tmp_path: Path, monkeypatc
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
 
 
+@pytest.mark.rest
 def test_play_records(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """`softmode play --rerun` writes an episode with both cameras; interrupted, it leaves the file that was there."""
     monkeypatch.setattr(gym.spec("softmode/LiftSoft-v0"), "max_episode_steps", 3)
