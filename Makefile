@@ -77,16 +77,20 @@ resolve: $(VENV)/.created  ## check that all extras resolve to wheels on every s
 demo: $(VENV)/.demo  ## play the scripted lift and write out/lift.mp4
 	$(BIN)/softmode play softmode/LiftSoft-v0 --policy scripted --video out/lift.mp4 $(ARGS)
 
-test-fast: $(VENV)/.dev  ## run a few quick tests of every room
+# All cores compile an environment's kernels at once, before the processes of a run wait for each other's.
+$(WARP_CACHE_PATH): | $(VENV)/.dev
+	$(BIN)/python -c 'import gymnasium, softmode; gymnasium.make("softmode/LiftSoft-v0", obs_type="pixels").reset()'
+
+test-fast: $(VENV)/.dev | $(WARP_CACHE_PATH)  ## run a few quick tests of every room
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist worksteal -m fast $(ARGS)
 
-test: $(VENV)/.dev  ## run of every property the cheapest tests that show it
+test: $(VENV)/.dev | $(WARP_CACHE_PATH)  ## run of every property the cheapest tests that show it
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(FILES) $(ARGS)
 
-test-rest: $(VENV)/.dev  ## run what `make test` leaves out: deeper repetitions, sphinx, the browser; not the slow ones
+test-rest: $(VENV)/.dev | $(WARP_CACHE_PATH)  ## run what `make test` leaves out: deeper repetitions, sphinx, the browser; not the slow ones
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(FILES) -m '(rest or sphinx or browser) and not slow' $(ARGS)
 
-test-slow: $(VENV)/.dev  ## run all tests, slow ones included
+test-slow: $(VENV)/.dev | $(WARP_CACHE_PATH)  ## run all tests, slow ones included
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(FILES) -m 'slow or not slow' $(ARGS)
 
 lint: $(VENV)/.dev  ## ruff, pyright, words that may not come back, names of what is not there
