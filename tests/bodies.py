@@ -11,7 +11,7 @@ import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ParamSpec
+from typing import ParamSpec, cast
 
 import numpy as np
 
@@ -65,7 +65,7 @@ def kept(recipe: Callable[Given, Recipe]) -> Callable[Given, ReducedBody]:
         return cached_body(("bodies of the tests", Path(__file__), key), made.build)
 
     BODIES[recipe.__name__], RECIPES[recipe.__name__] = body, recipe
-    return body
+    return cast(Callable[Given, ReducedBody], body)
 
 
 def freeform(mode_count: int, kernel_count: int, cubature_count: int) -> BuildOptions:
