@@ -44,7 +44,7 @@ _FAST = {
     "deformables/test_energies.py": "uniform_stretch",
     "deformables/test_factor.py": "solve back_substitution_with_known_unknowns",
     "deformables/test_friction.py": "stick_potential slides_above_the_cone",
-    "deformables/test_grips.py": "a_pull_adds_its_force_times_dt_to_the_momentum",
+    "deformables/test_grips.py": "a_pull_adds_its_force_times_dt_to_the_momentum a_hold_turns_the_short_way",
     "deformables/test_materials.py": "stress_is_the_gradient hessian_is_the_projected_derivative singular_values",
     "deformables/test_pairs.py": "gradient_of_the_potential_of_a_world",
     "deformables/test_quadrature.py": "box_is_integrated_exactly sphere_and_capsule_have_closed_form_moments",
@@ -56,7 +56,8 @@ _FAST = {
     "deformables/test_skinning_adjoint.py": "matches_central_differences",
     "deformables/test_solver_reduced.py": "step_equals_dense_reference free_fall captured_graph_equals_eager",
     "deformables/test_static_response.py": "axial_response_is_that_of_a_hanging_bar",
-    "demonstrations/test_format.py": "info data_table episodes_table",
+    "demonstrations/test_format.py": "info data_table episodes_table"
+    " statistics_of_the_dataset_equal_those_of_all_its_frames",
     "documentation/test_prose.py": "",
     "objects/test_objects.py": "part_is_chosen_by_its_rule a_tilted_box_lies_down_on_its_nearest_face",
     "objects/test_primitives.py": "solid_has_the_closed_form_volume_area_and_bounds",
@@ -86,8 +87,17 @@ _FAST = {
     "test_words.py": "",
     "usd/test_export_bundle.py": "",
     "usd/test_import_newton.py": "units_of_everything",
-    "view/test_session.py": "time_passes_as_told pick_meets_the_near_face",
+    "view/test_session.py": "time_passes_as_told pick_meets_the_near_face time_that_did_not_fit_is_lost",
     "scenes/test_meshes.py": "bounds_and_volume",
+    "deformables/test_driven.py": "driven_regions_follow_their_poses",
+    "deformables/test_proxy.py": "free_body_alone",
+    "mpm/test_shapes.py": "momentum_goes_to_the_shapes",
+    "radiance/test_grid.py": "plenoxels",
+    "usd/test_import_scene.py": "material_of_ancestors_and_purposes",
+    "usd/test_export.py": "places_turn_the_short_way",
+    "robots/test_chain.py": "forward_is_the_compiler_s",
+    "test_cli_splat.py": "convert_knows_what_is_up_in_the_file_it_reads",
+    "envs/test_press_soft.py": "success_needs_the_force_in_the_middle_for_a_while",
 }
 """Tests of `make test-fast`: quick ones of every room, by file; all of a file where none is named."""
 
