@@ -36,6 +36,8 @@ from softmode.usd import add_usd, read_usd_scene
 from tests.marks import rest_but
 from tests.usd.stages import KINDS, Author, Gf, Sdf, UsdGeom, UsdPhysics, UsdShade, UsdVol, box, shell, transform
 
+pytestmark = pytest.mark.usefixtures("forked")
+
 EPSILON = float(np.finfo(np.float32).eps)
 SMALL = BuildOptions(mode_count=3, kernel_count=120, cubature_count=128)
 FEW: dict[str, Any] = {"build_options": SMALL, "surface_count": 60}
