@@ -104,7 +104,7 @@ dist: $(VENV)/.dev  ## build sdist and wheel
 	$(BIN)/python -m hatchling build -t sdist -t wheel
 
 smoke: dist  ## install the wheel alone into a new environment, make an environment, reset, step
-	$(BIN)/python -m pytest tests/test_packaging.py $(ARGS)
+	$(BIN)/python -m pytest -m 'not slow' tests/test_packaging.py $(ARGS)
 
 bench: $(VENV)/.demo  ## time the build, a step and each stage of a grasp
 	$(BIN)/python benchmarks/build.py

@@ -329,7 +329,7 @@ def test_a_stiffer_part_is_in_the_body(assets: Path) -> None:
 def test_a_body_file_says_what_it_is_made_of(assets: Path, tmp_path: Path) -> None:
     """What is given when it is built is what a task takes, unless the command says otherwise."""
     out = tmp_path / "toy.npz"
-    build = ["body", "build", str(assets / "floater.ply"), *UP, *QUICK, "-o", str(out)]
+    build = ["body", "build", str(assets / "open.obj"), *QUICK, "-o", str(out)]
     assert main([*build, "--youngs-modulus", "3e5", "--friction", "0.9"]) == 0
     config = ObjectOptions(object=out, friction=0.4).configured(LiftSoftConfig())
     material = config.scene.material

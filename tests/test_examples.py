@@ -42,7 +42,7 @@ ROOMS = {
     "robots": "robot_by_name",
     "mpm": "morph_topology",
     "radiance": "radiance_field",
-    "objects": "paint_stiffness",
+    "objects": "jelly_squeeze",
     "scenes": "drop_a_splat",
     "envs": "lift_a_toy",
     "usd": "usd_in_usd_out",

@@ -21,6 +21,7 @@ DEAR = {
     "docs/howto/tune_a_material.md",
     "docs/body_tool.md",
     "docs/local_handles.md",
+    "README.md",
     *("docs/objects.md", "docs/usd.md", "docs/view.md", "docs/bodies.md", "docs/rerun.md", "docs/radiance.md"),
     *("docs/cutting.md", "docs/robots.md", "docs/howto/own_splat.md", "docs/howto/own_robot.md"),
     "docs/howto/own_env.md",

@@ -44,6 +44,8 @@ from tests.usd.export_scenes import (
 )
 from tests.usd.test_damage import mutate
 
+pytestmark = pytest.mark.usefixtures("forked")
+
 pytest.importorskip("pxr", reason="needs the extra [usd]")
 Gf, Usd, UsdGeom = (importlib.import_module(f"pxr.{name}") for name in ("Gf", "Usd", "UsdGeom"))
 EPSILON = float(np.finfo(np.float32).eps)

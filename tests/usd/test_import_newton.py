@@ -36,8 +36,12 @@ from softmode.usd import add_usd, read_usd_scene
 from tests.marks import rest_but
 from tests.usd.stages import KINDS, Author, Gf, Sdf, UsdGeom, UsdPhysics, UsdShade, UsdVol, box, shell, transform
 
+pytestmark = pytest.mark.usefixtures("forked")
+
 EPSILON = float(np.finfo(np.float32).eps)
 SMALL = BuildOptions(mode_count=3, kernel_count=120, cubature_count=128)
+FEW: dict[str, Any] = {"build_options": SMALL, "surface_count": 60}
+"""Options of a body that nobody looks at closely: samples of the surface take most of its build."""
 
 
 def everything(path: Path, up: str = "Z", meters: float = 1.0, kilograms: float = 1.0) -> Path:
@@ -210,13 +214,13 @@ def test_the_body_is_the_one_built_by_hand(tmp_path: Path) -> None:
     author.body("/World/Toy", "Mesh", matrix=transform((0.3, 0.2, 0.1), turn=1.0))
     author.body("/World/Plush", "ParticleField3DGaussianSplat")
     author.save()
-    found = add_usd(newton.ModelBuilder(), tmp_path / "a.usda", build_options=SMALL)
+    found = add_usd(newton.ModelBuilder(), tmp_path / "a.usda", **FEW)
     mesh, own = box(), dataclasses.replace(SMALL, poissons_ratio=found.bodies["/World/Toy"].material.poissons_ratio)
-    quadrature = quadrature_from_mesh(mesh.vertices.astype(np.float32), mesh.faces)
+    quadrature = quadrature_from_mesh(mesh.vertices.astype(np.float32), mesh.faces, surface_count=60)
     assert own != SMALL
     assert found.bodies["/World/Toy"].body.fingerprint == build_body(quadrature, own, name="Toy").fingerprint
     splats = shell()
-    quadrature = quadrature_from_splats(splats.means, splats.scales, splats.quats, splats.opacities)
+    quadrature = quadrature_from_splats(splats.means, splats.scales, splats.quats, splats.opacities, surface_count=60)
     assert found.bodies["/World/Plush"].body.fingerprint == build_body(quadrature, own, name="Plush").fingerprint
 
 
@@ -230,7 +234,7 @@ def test_what_the_stage_does_not_say(tmp_path: Path) -> None:
     author.save()
     given = Material(youngs_modulus=3e4, density=150.0)
     asked = {"only": "/World/Toy"}  # a surface that is not closed is cloth unless one asks for a solid
-    found = add_usd(newton.ModelBuilder(), tmp_path / "a.usda", build_options=SMALL, material=given, **asked)
+    found = add_usd(newton.ModelBuilder(), tmp_path / "a.usda", material=given, **FEW, **asked)
     toy = found.bodies["/World/Toy"]
     assert toy.material == given
     assert toy.body.volume == pytest.approx(0.1 * 0.08 * 0.06, rel=0.05)
@@ -244,7 +248,7 @@ def test_picture_from_a_visible_mesh(tmp_path: Path) -> None:
     mesh = author.geometry("/World/Toy/Look", "Mesh")
     UsdGeom.Mesh(mesh).CreateDisplayColorAttr([(0.2, 0.4, 0.8)])
     author.save()
-    toy = add_usd(newton.ModelBuilder(), tmp_path / "a.usda", build_options=SMALL, splat_count=500).bodies["/World/Toy"]
+    toy = add_usd(newton.ModelBuilder(), tmp_path / "a.usda", splat_count=500, **FEW).bodies["/World/Toy"]
     assert toy.splats is not None and toy.splats.count == 500
     gamma = 1.055 * np.array([0.2, 0.4, 0.8]) ** (1 / 2.4) - 0.055
     np.testing.assert_allclose(toy.splats.colors(), np.tile(gamma, (500, 1)), atol=1e-5)
@@ -281,7 +285,7 @@ def test_two_of_a_kind_share_a_body(tmp_path: Path, kind: str) -> None:
         author.place(prim, matrix)
     author.save()
     builder = newton.ModelBuilder()
-    found = add_usd(builder, tmp_path / "a.usda", build_options=SMALL)
+    found = add_usd(builder, tmp_path / "a.usda", **FEW)
     assert len(found.bodies) == 2 and len(found.reduced_bodies) == 1
     np.testing.assert_allclose(found.bodies["/World/B/Toy"].rotation, transform(turn=0.8)[:3, :3], atol=1e-12)
 
@@ -329,9 +333,7 @@ def test_place_of_a_stage(tmp_path: Path, up: str) -> None:
     author.save()
     place = transform((1.0, 2.0, 0.5), turn=0.5)
     builder = newton.ModelBuilder()
-    found = add_usd(
-        builder, tmp_path / "a.usda", position=place[:3, 3].tolist(), rotation=place[:3, :3], build_options=SMALL
-    )
+    found = add_usd(builder, tmp_path / "a.usda", position=place[:3, 3].tolist(), rotation=place[:3, :3], **FEW)
     body = found.bodies["/World/Toy"]
     expected = [place[:3, :3] @ np.array(x) + place[:3, 3] for x in ((0.3, 0.0, 0.1), (0.0, 0.2, 0.1))]
     np.testing.assert_allclose(builder.body_q[0][:3], expected[0], atol=1e-6)

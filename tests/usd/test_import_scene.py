@@ -17,6 +17,8 @@ from softmode.objects.stage_body import build_deformable
 from softmode.usd import read_usd_scene
 from tests.usd.stages import EDGES, FAMILIES, KINDS, MATERIAL, Author, Sdf, UsdGeom, UsdShade, UsdVol, shell, transform
 
+pytestmark = pytest.mark.usefixtures("forked")
+
 EPSILON = float(np.finfo(np.float32).eps)
 VOLUME = float(np.prod(EDGES))
 COARSE = {"Mesh": 1e-6, "TetMesh": 1e-6, "Points": 0.03, "ParticleField3DGaussianSplat": 0.08}
@@ -43,7 +45,7 @@ def test_every_kind_and_family(tmp_path: Path, kind: str, family: str) -> None:
     assert (found.path, found.kind) == ("/World/Toy", kind)
     np.testing.assert_allclose(found.rotation, transform(turn=0.5)[:3, :3], atol=1e-12)
     np.testing.assert_allclose(found.translation, (0.1, 0.2, 0.3), atol=1e-12)
-    body = build_deformable(found, COARSE_BUILD)
+    body = build_deformable(found, COARSE_BUILD, surface_count=60)
     assert body.volume == pytest.approx(VOLUME, rel=COARSE[kind])
     assert np.abs(body.offset).max() < 0.02 * min(EDGES)
     material = found.material(body.volume)
@@ -97,7 +99,7 @@ def test_stretched_and_mirrored(tmp_path: Path, kind: str) -> None:
     found = read_one(tmp_path / "a.usdc")
     whole = matrix @ shear
     assert np.linalg.det(found.rotation) == pytest.approx(1.0)
-    body = build_deformable(found, COARSE_BUILD)
+    body = build_deformable(found, COARSE_BUILD, surface_count=100)
     assert body.volume == pytest.approx(VOLUME * abs(np.linalg.det(whole[:3, :3])), rel=3 * COARSE[kind])
     surface = body.surface_points + body.offset
     world = surface @ found.rotation.T + found.translation

@@ -42,25 +42,6 @@ def test_splats_ride() -> None:
     assert np.allclose(means.numpy()[0], x, atol=1e-6)
 
 
-def test_colors_cross_to_the_target() -> None:
-    """Colours begin as the source's and end as those of the target's nearest splats; particles show the same."""
-    solids, bodies = filled([solid_of("sphere"), solid_of("torus")], spacing=None, count=800)
-    options = MorphOptions(frame_count=20)
-    run = morph(*bodies, options, device="cpu")
-    scene = MorphScene(run, solids, bodies, options, device="cpu")
-    frames = list(scene.frames(stride=5))
-    assert len(frames) == 5
-    first, last = frames[0][3], frames[-1][3]
-    assert np.allclose(first, scene.splats.sh[:, 0], atol=1e-6)
-    known = np.unique(np.round(solids[1].splats.sh[:, 0], 4), axis=0)
-    distance = np.abs(last[::50, None] - known[None]).max(axis=2).min(axis=1)
-    assert distance.max() < 1e-3
-    between = frames[2][3]
-    assert 0.0 < np.abs(between - first).sum() < np.abs(last - first).sum()
-    alone = MorphScene(run, solids, bodies, options, as_particles=True, device="cpu")
-    assert alone.splats.count == bodies[0].count < scene.splats.count
-
-
 @pytest.fixture(scope="module")
 def scenes() -> list[MorphScene]:
     """Return a short morph as splats, and as particles."""
@@ -68,6 +49,21 @@ def scenes() -> list[MorphScene]:
     options = MorphOptions(frame_count=20)
     run = morph(*bodies, options, device="cpu")
     return [MorphScene(run, solids, bodies, options, as_particles=only, device="cpu") for only in (False, True)]
+
+
+def test_colors_cross_to_the_target(scenes: list[MorphScene]) -> None:
+    """Colours begin as the source's and end as those of the target's nearest splats; particles show the same."""
+    scene, alone = scenes
+    frames = list(scene.frames(stride=5))
+    assert len(frames) == 5
+    first, last = frames[0][3], frames[-1][3]
+    assert np.allclose(first, scene.splats.sh[:, 0], atol=1e-6)
+    known = np.unique(np.round(solid_of("torus").splats.sh[:, 0], 4), axis=0)
+    distance = np.abs(last[::50, None] - known[None]).max(axis=2).min(axis=1)
+    assert distance.max() < 1e-3
+    between = frames[2][3]
+    assert 0.0 < np.abs(between - first).sum() < np.abs(last - first).sum()
+    assert alone.splats.count == alone.run.positions.shape[1] < scene.splats.count
 
 
 def test_a_recording_holds_splats_particles_and_the_loss(scenes: list[MorphScene], tmp_path: Path) -> None:
