@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from softmode.cli.common import finding_line, optional_argument, own_object, quiet_warp, same_fields, short_name
-from softmode.cli.object_options import ObjectOptions, named_numbers
+from softmode.cli.object_options import ObjectOptions, named_numbers, typed
 from softmode.errors import ConfigError, GraspError
 from softmode.files import check_place
 
@@ -251,10 +251,10 @@ def _examined(options: _Asset) -> tuple[SoftObject, BodyReport]:
     toy = options.toy if options.file is None else dataclasses.replace(options.toy, object=path)
     if toy.splat is None and toy.preset is None and file_kind(path) == "body":
         given = [f.name for f in dataclasses.fields(_Asset)[1:-1] if getattr(options, f.name) != f.default]  # file, toy
-        given = [name.replace("_colors", "_by_color").replace("_", "-") for name in (*given, *toy.shape)]
+        given = [typed(name) for name in (*given, *toy.shape)]
         if given or isinstance(options, BodyBuild):
             raise ConfigError(
-                f"{path} is a body already{': --' + ', --'.join(given) if given else ''}",
+                f"{path} is a body already{': ' + ', '.join(given) if given else ''}",
                 hint="give the file that it was built from",
             )
         found, quadrature = load(path), None

@@ -180,8 +180,12 @@ class ObjectOptions:
     def _refuse(given: Any, what: str, hint: str) -> None:
         """Refuse options that say nothing about an object."""
         if given:
-            names = ", ".join(f"--{name.replace('_colors', '_by_color').replace('_', '-')}" for name in given)
-            raise ConfigError(f"{names} given for {what}", hint=hint)
+            raise ConfigError(f"{', '.join(map(typed, given))} given for {what}", hint=hint)
+
+
+def typed(field: str) -> str:
+    """Return an option as it is typed, from the field that it becomes."""
+    return f"--{field.replace('_colors', '_by_color').replace('_', '-')}"
 
 
 def named_numbers(option: str, text: str, counts: tuple[int, ...]) -> tuple[str, list[float]]:

@@ -19,6 +19,7 @@ from softmode.deformables.build.quadrature import quadrature_from_box, quadratur
 from softmode.deformables.build.quadrature_grid import Quadrature
 from softmode.deformables.build.region_samples import octants_near, refine_at_faces
 from softmode.errors import BasisError, ConfigError
+from tests.bodies import assert_same
 
 INF = np.inf
 OPTIONS = BuildOptions(mode_count=3, kernel_count=150, cubature_count=64)
@@ -214,14 +215,7 @@ def test_files_round_trip(body: ReducedBody, tmp_path: Path) -> None:
     file = tmp_path / "body.npz"
     body.save(file)
     loaded = ReducedBody.load(file)
-    for f in dataclasses.fields(body):
-        value, other = getattr(body, f.name), getattr(loaded, f.name)
-        if isinstance(value, np.ndarray):
-            np.testing.assert_array_equal(value, other, err_msg=f.name)
-        elif f.name == "sources":
-            assert value.keys() == other.keys() and all(np.array_equal(value[name], other[name]) for name in value)
-        else:
-            assert value == other, f.name
+    assert_same(body, loaded)
     np.testing.assert_array_equal(body.evaluate(body.points)[0], loaded.evaluate(body.points)[0])
 
 

@@ -18,6 +18,7 @@ from softmode.deformables.build.quadrature import quadrature_from_box
 from softmode.deformables.materials.material import Material
 from softmode.deformables.materials.material_kernels import MaterialModel
 from softmode.splats import Splats
+from tests import bodies
 from tests.splats.test_splats import random_splats
 
 KINDS = ("affine", "quadratic", "regions")
@@ -58,17 +59,8 @@ def some_state(body: ReducedBody, seed: int = 7, scale: float = 1.0) -> np.ndarr
     return body.affine(scale * TURN, (0.3, -0.2, 0.5)) + 0.003 * rng.normal(size=(body.function_count, 3))
 
 
-def assert_same(one: ReducedBody, other: ReducedBody) -> None:
-    """Assert that two bodies are equal field by field, to the bit, but for what they were built from."""
-    for field in dataclasses.fields(ReducedBody):
-        if field.name == "sources":
-            continue
-        a, b = getattr(one, field.name), getattr(other, field.name)
-        if isinstance(a, np.ndarray):
-            assert a.dtype == b.dtype and a.shape == b.shape, field.name
-            assert a.tobytes() == b.tobytes(), field.name
-        else:
-            assert a == b and type(a) is type(b), field.name
+assert_same = functools.partial(bodies.assert_same, skip=("sources",))
+"""Assert that two bodies are equal to the bit, but for what they were built from, which no stage has."""
 
 
 def assert_same_splats(one: Splats, other: Splats) -> None:

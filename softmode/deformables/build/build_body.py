@@ -251,14 +251,12 @@ def body_fingerprint(
     quadrature: Quadrature,
     options: BuildOptions,
     name: str,
-    regions: Sequence[Region] = (),
-    stiffness: Array | None = None,
-    density: Array | None = None,
+    regions: Sequence[Region],
+    stiffness: Array,
+    density: Array,
 ) -> str:
-    """Return the fingerprint of all that a body is built from; a field has a value per point, None stands for ones."""
-    ones = np.ones(len(quadrature.points))
-    fields = (ones if field is None else field for field in (stiffness, density))
-    return fingerprint_of(FORMAT_VERSION, quadrature, options, name, list(regions), *fields)
+    """Return the fingerprint of all that a body is built from; stiffness and density are relative, one per point."""
+    return fingerprint_of(FORMAT_VERSION, quadrature, options, name, list(regions), stiffness, density)
 
 
 def _cubature(volumes: Array, basis: BodyBasis, stiffness: Array, options: BuildOptions, *, quick: bool) -> Cubature:
