@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parents[1]
 FLOORS = (
     "softmode errors",
     "files checks lazy pause quiet versions",
-    "deformables stages",
+    "deformables foreign",
     "splats robots mpm",
     "radiance",
     "objects",
@@ -95,7 +95,7 @@ def test_modules_form_no_circle() -> None:
 def test_arrows_up_and_circles_are_seen() -> None:
     """The rules find an arrow up, one between neighbours, and leave those down and within a room alone."""
     arrows = {
-        "softmode.splats.a": {"softmode.stages.b", "softmode.splats.c", "softmode.robots", "softmode.cli.main"},
+        "softmode.splats.a": {"softmode.foreign.b", "softmode.splats.c", "softmode.robots", "softmode.cli.main"},
         "softmode.deformables": {"softmode.deformables.solver.x"},
         "softmode.deformables.solver.x": {"softmode.deformables", "softmode.deformables.body.y"},
     }

@@ -177,8 +177,8 @@ class SplatConvert:
 
     def run(self) -> int:
         """Read and write."""
+        from softmode.foreign import tokens
         from softmode.splats.formats import CONVENTIONS, read_splats, write_splats
-        from softmode.stages import tokens
 
         check_splat_target(self.target)
         if self.convention is None and self.up is not None:

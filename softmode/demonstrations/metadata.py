@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,10 +15,10 @@ from softmode.demonstrations import schema
 from softmode.demonstrations.schema import INDEX_FEATURES, Feature
 from softmode.demonstrations.statistics import QUANTILES, Statistics, combine
 from softmode.errors import AssetError, ConfigError
+from softmode.foreign import process
+from softmode.foreign.child.layers import inside
 
 LARGEST_JSON = 64 << 20
-LARGEST_TABLE = 4 << 30
-"""Bytes of a table, uncompressed, that are read at most."""
 REMEDY = "restore the folder from a copy, or record it again"
 
 
@@ -46,9 +47,9 @@ class Metadata:
     origins: tuple[dict[str, Any], ...]
     """Where the episodes come from, each from its ``first_episode`` on: environment and options; empty if not said."""
 
-    def data_table(self, row: Mapping[str, Any]) -> Any:
-        """Return the table that holds an episode's frames; raises AssetError if it does not."""
-        return read_table(self.folder / schema.DATA_PATH.format(**file_of(row, "data")))
+    def data_table(self, row: Mapping[str, Any], columns: list[str] | None = None) -> Any:
+        """Return the table that holds an episode's frames, or some columns; raises AssetError if it does not."""
+        return read_table(member(self.folder, schema.DATA_PATH.format(**file_of(row, "data"))), columns)
 
     def combined(self) -> dict[str, Statistics]:
         """Return the statistics over all episodes by feature."""
@@ -78,23 +79,42 @@ def read_json(path: Path) -> dict[str, Any]:
     return content
 
 
+def member(folder: Path, name: str) -> Path:
+    """Return a file of a dataset; raises AssetError if links lead out of its folder, or it is no file."""
+    path = folder / name
+    if not inside(str(path), str(folder)):
+        hint = "copy the dataset with its links followed, as cp -rL does"
+        raise AssetError(f"{path} leads out of the dataset's folder", hint=hint)
+    if path.exists() and not path.is_file():
+        raise AssetError(f"{path} is no file", hint=REMEDY)
+    return path
+
+
+@process.typed("table")
 def read_table(path: Path, columns: list[str] | None = None) -> Any:
-    """Return a Parquet file's table; raises AssetError if it is damaged or unreasonably large."""
-    pa = schema.arrow()
-    try:
-        with pa.parquet.ParquetFile(path, page_checksum_verification=True) as file:
-            size = sum(file.metadata.row_group(k).total_byte_size for k in range(file.metadata.num_row_groups))
-            if size > LARGEST_TABLE:
-                raise AssetError(f"{path} holds {size} bytes", hint="read datasets of at most 4 GB per file")
-            table = file.read(columns=columns, use_threads=False)
-            table.validate(full=True)
-            return table
-    except (OSError, ValueError, pa.ArrowException, KeyError, OverflowError, MemoryError) as error:
-        if isinstance(error, AssetError):
-            raise
-        raise AssetError(f"{path} cannot be read: {error}", hint=REMEDY) from error
+    """Return a Parquet file's table, or of its columns those that are named and there.
+
+    Raises:
+        AssetError: If it is damaged, or takes more than 8 bytes for each of the file and 256 MB.
+    """
+    pa, name = schema.arrow(), str(path)
+    with tempfile.TemporaryDirectory() as folder:
+        copy = f"{folder}/table.arrow"
+        process.read("table", path, name=name, columns=columns, copy=copy)
+        with pa.OSFile(copy) as source:
+            return pa.ipc.open_file(source).read_all()
 
 
+def _rows(path: Path) -> list[dict[str, Any]]:
+    """Return the rows of a small table; a cell takes many times as much memory as in the table."""
+    table = read_table(path)
+    size = path.stat().st_size
+    if table.nbytes > 4 * size + (16 << 20) or table.num_rows * table.num_columns > size + (1 << 20):
+        raise AssetError(f"{path} holds {table.num_rows} rows, too many for {size} bytes", hint=REMEDY)
+    return table.to_pylist()
+
+
+@process.typed("dataset")
 def read_metadata(folder: str | Path) -> Metadata:
     """Return what the dataset in a folder says about itself.
 
@@ -105,7 +125,7 @@ def read_metadata(folder: str | Path) -> Metadata:
         AssetError: If the folder holds no dataset of version 3.0, or a damaged one.
     """
     folder = Path(folder).absolute()
-    path = folder / schema.INFO_PATH
+    path = member(folder, schema.INFO_PATH)
     info = read_json(path)
     try:
         version = info["codebase_version"]
@@ -153,7 +173,7 @@ def _ordered(features: dict[str, Feature]) -> dict[str, Feature]:
 
 def _read_origins(folder: Path, episodes: int) -> tuple[dict[str, Any], ...]:
     """Return where the episodes come from; what a killed recording left behind the last one is left out."""
-    path = folder / schema.ORIGINS_PATH
+    path = member(folder, schema.ORIGINS_PATH)
     if not path.exists():
         return ()
     origins = read_json(path).get("origins")
@@ -166,12 +186,12 @@ def _read_origins(folder: Path, episodes: int) -> tuple[dict[str, Any], ...]:
 
 def _read_tasks(folder: Path) -> tuple[str, ...]:
     """Return the task sentences by number."""
-    path = folder / schema.TASKS_PATH
-    table = read_table(path)
-    names = [name for name in table.column_names if name != "task_index"]
-    if len(names) != 1 or "task_index" not in table.column_names:
-        raise AssetError(f"{path} has columns {table.column_names}", hint=REMEDY)
-    numbers, tasks = table["task_index"].to_pylist(), table[names[0]].to_pylist()
+    path = member(folder, schema.TASKS_PATH)
+    rows = _rows(path)
+    names = [name for name in (rows or [{"task_index": 0, "task": ""}])[0] if name != "task_index"]
+    if len(names) != 1 or not all("task_index" in row for row in rows):
+        raise AssetError(f"{path} has columns {names}", hint=REMEDY)
+    numbers, tasks = [row["task_index"] for row in rows], [row[names[0]] for row in rows]
     if numbers != list(range(len(numbers))) or not all(isinstance(task, str) for task in tasks):
         raise AssetError(f"{path} does not number its tasks 0, 1, 2 ...", hint=REMEDY)
     return tuple(tasks)
@@ -185,7 +205,7 @@ def _read_episodes(
     for path in sorted((folder / "meta" / "episodes").glob("chunk-*/file-*.parquet")):
         if len(rows) >= episodes:
             break
-        rows += read_table(path).to_pylist()
+        rows += _rows(member(folder, str(path.relative_to(folder))))
     rows = rows[:episodes]
     statistics, end = [], 0
     try:

@@ -14,11 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softmode.demonstrations import schema
-from softmode.demonstrations.metadata import REMEDY, Metadata, file_of, read_metadata
+from softmode.demonstrations.metadata import REMEDY, Metadata, file_of, member, read_metadata
 from softmode.demonstrations.pictures import decode_png, read_film
 from softmode.demonstrations.schema import INDEX_FEATURES, Feature
 from softmode.demonstrations.statistics import Statistics
 from softmode.errors import AssetError, ConfigError
+from softmode.foreign import process
 
 if TYPE_CHECKING:
     from softmode.envs.env_state import EnvState
@@ -76,12 +77,13 @@ class Dataset:
         from softmode.envs.env_state import EnvState
 
         self.episode(number)
-        path = None if self.folder is None else self.folder / schema.STATE_PATH.format(number=number)
+        path = None if self.folder is None else member(self.folder, schema.STATE_PATH.format(number=number))
         if path is None or not path.exists():
             raise ConfigError(f"episode {number} has no state", hint="record with --states, or states=True")
         return EnvState.load(path)
 
 
+@process.typed("dataset")
 def read_dataset(
     folder: str | os.PathLike[str], *, keys: Collection[str] | None = None, max_bytes: int = 4 << 30
 ) -> Dataset:
@@ -135,7 +137,7 @@ def _read_data(found: Metadata, kinds: Mapping[str, Feature]) -> dict[str, NDArr
     for file, group in itertools.groupby(found.rows, lambda row: tuple(file_of(row, "data").values())):
         rows = list(group)
         count = rows[-1]["dataset_to_index"] - rows[0]["dataset_from_index"]
-        table = found.data_table(rows[0])
+        table = found.data_table(rows[0], list(kinds))
         if table.num_rows < count:
             raise AssetError(f"{found.folder}: data file {file} holds {table.num_rows} of {count} frames", hint=REMEDY)
         table = table.slice(0, count)
@@ -197,7 +199,7 @@ def _read_video(found: Metadata, name: str, kind: Feature) -> NDArray[np.uint8]:
     """Return the pictures of a camera whose films are files of their own."""
     pictures = np.empty((found.frame_count, *kind.shape), np.uint8)
     for file, rows in itertools.groupby(found.rows, lambda row: file_of(row, f"videos/{name}")):
-        path, shown = found.folder / schema.VIDEO_PATH.format(video_key=name, **file), 0
+        path, shown = member(found.folder, schema.VIDEO_PATH.format(video_key=name, **file)), 0
         with contextlib.closing(read_film(path, kind.shape)) as film:
             for row in rows:
                 first = round(row[f"videos/{name}/from_timestamp"] * found.fps)

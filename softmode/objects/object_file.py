@@ -14,6 +14,7 @@ from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.materials.material import Material
 from softmode.errors import AssetError
 from softmode.files import damage_errors
+from softmode.foreign import tokens
 from softmode.objects.presets import PRESETS
 from softmode.objects.soft_object import SoftObject
 from softmode.radiance.formats import is_radiance
@@ -21,7 +22,6 @@ from softmode.radiance.grid import RadianceGrid
 from softmode.splats.formats import READABLE
 from softmode.splats.point_cloud import ply_kind, splats_from_points
 from softmode.splats.splats import Splats
-from softmode.stages import tokens
 
 FileKind = Literal["splat", "points", "mesh", "radiance", "body"]
 _PARTS = {

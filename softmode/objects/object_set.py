@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from softmode.checks import SEED_MAX, require_choice, require_number
 from softmode.deformables.materials.material import Material
 from softmode.errors import ConfigError
+from softmode.foreign import tokens
 from softmode.objects.config import FILES, ObjectConfig
 from softmode.objects.object_file import file_kind
 from softmode.objects.presets import PRESETS
 from softmode.radiance.formats import SUFFIXES as RADIANCE
 from softmode.splats.formats import READABLE
-from softmode.stages import tokens
 
 Order = Literal["drawn", "in_turn"]
 MOST = 8

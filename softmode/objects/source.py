@@ -18,6 +18,7 @@ from softmode.deformables.build.quadrature_grid import Quadrature
 from softmode.deformables.build.quadrature_mesh import cap_holes, quadrature_from_mesh
 from softmode.errors import AssetError, ConfigError
 from softmode.files import read_archive, write_archive
+from softmode.foreign import tokens
 from softmode.objects.config import ObjectConfig
 from softmode.objects.mesh_file import read_mesh
 from softmode.objects.parts import choose_part
@@ -39,7 +40,6 @@ from softmode.splats.colored_mesh import ColoredMesh
 from softmode.splats.formats import read_splats
 from softmode.splats.point_cloud import is_point_cloud, read_points
 from softmode.splats.splats import Splats, up_rotation
-from softmode.stages import tokens
 
 DEFAULT_COLORS: tuple[Color, Color] = ((0.93, 0.55, 0.22), (0.97, 0.90, 0.76))
 """Colours of a shape that is given none."""

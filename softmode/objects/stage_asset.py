@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from typing import Literal
 
 import numpy as np
 
 from softmode.errors import AssetError
+from softmode.foreign import process
 from softmode.objects.soft_object import SoftObject
 from softmode.objects.stage_bundle import body_of
 from softmode.objects.stage_geometry import SurfaceMesh, mesh_surface, tet_surface
 from softmode.objects.stage_scene import parts_of, read_usd_scene, stage_frame
 from softmode.splats.colored_mesh import ColoredMesh
-from softmode.stages import process
 
 
 def asset_kind(path: str | os.PathLike[str]) -> Literal["body", "splat", "mesh"]:
@@ -101,7 +100,4 @@ def colored_mesh(surfaces: list[SurfaceMesh], name: str) -> ColoredMesh:
 
 def _ask(path: str | os.PathLike[str], *, geometry: bool) -> process.Answer:
     """Have the process of its own look at a stage."""
-    with tempfile.TemporaryDirectory() as folder:
-        request = process.make_request("asset", path, f"{folder}/answer", asset_root=None, limits=process.Limits())
-        request |= {"strict": True, "geometry": geometry}
-        return process.ask(request, name=f"OpenUSD file {path}")
+    return process.read("asset", path, name=f"OpenUSD file {path}", strict=True, geometry=geometry)

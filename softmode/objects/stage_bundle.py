@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from softmode.deformables.body.reduced_body import FORMAT, READABLE, ReducedBody
 from softmode.errors import AssetError
-from softmode.stages import tokens
+from softmode.foreign import tokens
 
 DTYPES = {"<f8": "double[]", "<f4": "float[]", "<i8": "int64[]"}
 """What fields may be made of, and the OpenUSD types of their attributes."""

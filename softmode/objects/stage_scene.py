@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from softmode.deformables.materials.material import Material
 from softmode.deformables.materials.material_kernels import MaterialModel
 from softmode.errors import AssetError, MaterialError
+from softmode.foreign import process, tokens
 from softmode.objects.stage_geometry import SurfaceMesh, finite_points, mesh_surface, split_transform, tet_surface
 from softmode.splats.formats.usd import UP_AXES, placed, splats_from_prim
 from softmode.splats.splats import MAX_SPLATS, Splats, joined, up_rotation
-from softmode.stages import process, tokens
 
 Kind = Literal["Mesh", "TetMesh", "Points", "ParticleField3DGaussianSplat"]
 Array = NDArray[np.float64]

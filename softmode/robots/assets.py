@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from softmode.errors import AssetError, ConfigError, MissingExtraError
-from softmode.stages.tokens import SUFFIXES
+from softmode.foreign.tokens import SUFFIXES
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -63,6 +63,8 @@ class RobotAsset:
     """Folder outside which the file may refer to nothing."""
     root_given: bool = True
     """Whether that was said; otherwise a URDF may also refer to the packages it names."""
+    trusted: bool = False
+    """Whether it comes from an installed package or from the Menagerie's archives, whose checksums are known."""
 
 
 def available() -> tuple[str, ...]:
@@ -136,7 +138,7 @@ def find(name: str, *, download: bool = True) -> RobotAsset:
     path = _resolve(registry, robot, cache, download) / robot.entry(robot.default_model).file
     # The Panda's hand has no site for its tool point, which lies between the finger pads.
     panda = {"end_effector": "hand", "tool_offset": (0.0, 0.0, 0.1034)} if full == "franka_emika_panda" else {}
-    return RobotAsset(name=full, path=path, asset_root=path.parent, **panda)
+    return RobotAsset(name=full, path=path, asset_root=path.parent, trusted=True, **panda)
 
 
 def _resolve(registry: Any, robot: Any, cache: Any, download: bool) -> Path:
@@ -192,6 +194,5 @@ def _aloha_arm() -> RobotAsset:
     if path is None:
         hint = "load 'vx300s', which is the same arm, or give the path of an MJCF, URDF or OpenUSD file"
         raise AssetError(f"robot {ALOHA_ARM!r} is not in the installed mujoco-warp", hint=hint)
-    return RobotAsset(
-        name=ALOHA_ARM, path=path, root="left\\base_link", end_effector="left\\gripper", asset_root=path.parent
-    )
+    root, end = "left\\base_link", "left\\gripper"
+    return RobotAsset(name=ALOHA_ARM, path=path, root=root, end_effector=end, asset_root=path.parent, trusted=True)

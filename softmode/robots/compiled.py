@@ -11,6 +11,7 @@ not that of actuators:
 
 from __future__ import annotations
 
+import functools
 import importlib
 import math
 from collections.abc import Collection, Mapping, Sequence
@@ -57,6 +58,7 @@ class CompiledRobot:
                 )
         if not model.njnt:
             raise AssetError(f"robot file {self.asset.path} holds no joint", hint="give it a hinge or a slide")
+        self._check_numbers()
         limited = model.jnt_limited.astype(bool)
         reference = model.qpos0[: model.njnt]
         self.reference = reference
@@ -69,6 +71,18 @@ class CompiledRobot:
         """Per joint its leader, and ratio and offset of q_joint = offset + ratio q_leader."""
         self.passive: list[int] = []
         """Joints without a drive, known after `drives`."""
+
+    def _check_numbers(self) -> None:
+        """Refuse masses and gains that are none, and ranges that are NaN."""
+        signed = ("qpos0", "actuator_gainprm", "actuator_biasprm", "actuator_gear")
+        positive = ("body_mass", "body_inertia", "dof_damping", "dof_armature", "dof_frictionloss")
+        ranges = ("jnt_range", "jnt_actfrcrange", "actuator_ctrlrange", "actuator_forcerange")
+        for names, low, high in ((signed, -1e9, 1e9), (positive, 0.0, 1e9), (ranges, -math.inf, math.inf)):
+            for name in names:
+                values = getattr(self.model, name)
+                if not np.all((values >= low) & (values <= high)):
+                    text = f"robot file {self.asset.path}: {name} is not all from {low} to {high}"
+                    raise AssetError(text, hint="mend its masses, gains and ranges")
 
     def link(self, body: int) -> str:
         """Return the name of a link."""
@@ -148,6 +162,9 @@ class CompiledRobot:
             total = sum(min(limit * abs(c), self._joint_limit(j)) * abs(ratio[j]) for j, c in arms.items() if c)
             stiffness, damping = -model.actuator_biasprm[a, 1], -model.actuator_biasprm[a, 2]
             affine = int(model.actuator_biastype[a]) == int(self.mujoco.mjtBias.mjBIAS_AFFINE)
+            if affine and (stiffness < 0.0 or damping < 0.0):
+                text = f"robot file {self.asset.path}: actuator {model.actuator(a).name!r} has negative gains"
+                raise AssetError(text, hint="give it kp and kv of at least zero")
             if not affine or stiffness <= 0.0:
                 torque_limit[leader] = total
                 continue
@@ -167,7 +184,7 @@ class CompiledRobot:
                 before = drives[j] or JointDrive(stiffness=0.0, damping=0.0, effort_limit=0.0)
                 drives[j] = JointDrive(
                     stiffness=float(before.stiffness + stiffness * lever**2 * share),
-                    damping=float(before.damping + max(0.0, damping) * lever**2 * share),
+                    damping=float(before.damping + damping * lever**2 * share),
                     effort_limit=float(before.effort_limit + total / (len(group) * abs(ratio[j]))),
                     lower=float(max(low, self.lower[j], before.lower)),
                     upper=float(min(high, self.upper[j], before.upper)),
@@ -234,16 +251,19 @@ class CompiledRobot:
         limited = self.model.jnt_actfrclimited[j]
         return float(np.min(np.abs(self.model.jnt_actfrcrange[j]))) if limited else math.inf
 
+    @functools.cached_property
+    def _inertias(self) -> np.ndarray:
+        """What each joint accelerates in the home pose, the others held [kg or kg m^2], shape (joint_count,)."""
+        mass = np.zeros((self.model.nv, self.model.nv))
+        self.mujoco.mj_fullM(self.model, self.data(self.home(None)), mass)
+        return np.diag(mass)
+
     def _default_drive(self, j: int, limit: float) -> JointDrive:
         """Return a critically damped drive for a joint without servo."""
-        model = self.model
-        mass = np.zeros((model.nv, model.nv))
-        data = self.data(self.home(None))
-        self.mujoco.mj_fullM(model, data, mass)
-        omega = 2.0 * math.pi * self.bandwidth
+        mass, omega = self._inertias[j], 2.0 * math.pi * self.bandwidth
         return JointDrive(
-            stiffness=float(mass[j, j] * omega**2),
-            damping=float(max(2.0 * mass[j, j] * omega - model.dof_damping[j], 0.0)),
+            stiffness=float(mass * omega**2),
+            damping=float(max(2.0 * mass * omega - self.model.dof_damping[j], 0.0)),
             effort_limit=limit,
             lower=float(self.lower[j]),
             upper=float(self.upper[j]),

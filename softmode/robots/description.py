@@ -13,7 +13,7 @@ import newton
 import numpy as np
 import warp as wp
 
-from softmode.checks import require_choice
+from softmode.checks import require_choice, require_fields
 from softmode.errors import AssetError, ConfigError
 
 ToolPose = tuple[float, float, float, float, float, float, float]
@@ -33,6 +33,14 @@ class JointDrive:
     """Least target [m or rad]."""
     upper: float = math.inf
     """Greatest target [m or rad]."""
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        require_fields(self, ("stiffness", "damping"), at_least=0.0, at_most=1.0e9)
+        if not self.effort_limit >= 0.0 or math.isnan(self.lower) or math.isnan(self.upper):
+            raise ConfigError(
+                f"{self} has a negative effort limit or NaN", hint="give numbers; inf stands for no limit"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,6 +19,8 @@ import numpy as np
 
 from softmode.checks import require_number
 from softmode.errors import AssetError, ConfigError
+from softmode.foreign import process
+from softmode.foreign.tokens import SUFFIXES
 from softmode.robots.assets import RobotAsset, find, names_file
 from softmode.robots.compiled import CompiledRobot
 from softmode.robots.description import RobotDescription
@@ -28,12 +30,12 @@ from softmode.robots.meshes import use_meshes
 from softmode.robots.references import check_references, default_root, read_xml
 from softmode.robots.stage_robot import read_stage
 from softmode.robots.written_mjcf import written_mjcf
-from softmode.stages.tokens import SUFFIXES
 
 _LEAST_MASS, _LEAST_INERTIA = 1.0e-4, 1.0e-7
 """What links that move get that have no mass of their own, [kg] and [kg m^2]."""
 
 
+@process.typed("robot file")
 def load(
     source: str | Path,
     *,
@@ -179,29 +181,28 @@ def _locate(source: str | Path, asset_root: str | Path | None, download: bool) -
 def _read(asset: RobotAsset) -> tuple[Any, list[str]]:
     """Return the editable MuJoCo specification of a file whose references have been checked, and notes."""
     if asset.path.suffix.lower() in SUFFIXES:
-        return read_stage(asset)
-    mujoco = importlib.import_module("mujoco")
-    tree, notes = read_xml(asset.path), []
+        spec, notes = read_stage(asset)
+        importlib.import_module("softmode.foreign.child.model").check_parts(spec)
+        return spec, notes
+    tree, notes, text = read_xml(asset.path), [], None
+    if tree.tag == "robot":
+        text, notes, size = _prepare_urdf(tree, asset)
+    elif tree.tag == "mujoco":
+        size = check_references(asset.path, asset.asset_root)
+    else:
+        raise AssetError(
+            f"robot file {asset.path} starts with <{tree.tag}>", hint="MJCF starts with <mujoco>, URDF with <robot>"
+        )
+    if not asset.trusted:
+        process.read("model", asset.path, name=f"robot file {asset.path}", text=text, size=size)
     try:
-        if tree.tag == "robot":
-            text, notes = _prepare_urdf(tree, asset)
-            spec = mujoco.MjSpec.from_string(text)
-        elif tree.tag == "mujoco":
-            check_references(asset.path, asset.asset_root)
-            spec = mujoco.MjSpec.from_file(str(asset.path))
-        else:
-            raise AssetError(
-                f"robot file {asset.path} starts with <{tree.tag}>", hint="MJCF starts with <mujoco>, URDF with <robot>"
-            )
+        return importlib.import_module("softmode.foreign.child.model").open_spec(str(asset.path), text), notes
     except (ValueError, RuntimeError) as error:
-        if isinstance(error, AssetError):
-            raise
         raise AssetError(f"robot file {asset.path}: {_one_line(error)}", hint="mend the file at that line") from error
-    return spec, notes
 
 
-def _prepare_urdf(tree: ElementTree.Element, asset: RobotAsset) -> tuple[str, list[str]]:
-    """Resolve the meshes of a URDF, and ask MuJoCo to keep its links and its shapes as they are; with notes."""
+def _prepare_urdf(tree: ElementTree.Element, asset: RobotAsset) -> tuple[str, list[str], int]:
+    """Resolve the meshes of a URDF, and ask MuJoCo to keep links and shapes as they are; with notes and size."""
     tree = copy.deepcopy(tree)
     for old in tree.findall("mujoco"):
         tree.remove(old)
@@ -221,7 +222,9 @@ def _prepare_urdf(tree: ElementTree.Element, asset: RobotAsset) -> tuple[str, li
             notes.append(f"link {link.get('name')!r} had an inertia that is none, only its diagonal is kept")
     for texture in tree.iter("texture"):
         texture.attrib.pop("filename", None)
-    return ElementTree.tostring(tree, encoding="unicode"), notes
+    files = {mesh.get("filename", "") for mesh in tree.iter("mesh")}
+    size = sum(Path(file).stat().st_size for file in files if Path(file).is_file())
+    return ElementTree.tostring(tree, encoding="unicode"), notes, size
 
 
 def _mended(inertia: ElementTree.Element) -> bool:
@@ -292,10 +295,6 @@ def _keep_robot(spec: Any, root: str | None, asset: RobotAsset) -> None:
         for element in list(group):
             if element.name not in used:
                 spec.delete(element)
-    for texture in list(spec.textures):
-        spec.delete(texture)
-    for material in spec.materials:
-        material.textures = [""] * len(material.textures)
     # What compiled once is found again; only the folder that a path counts from is made explicit.
     base = asset.path.parent.resolve() / spec.meshdir
     for element in (*spec.meshes, *spec.hfields):

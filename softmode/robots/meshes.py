@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import warnings
 from pathlib import Path
 from typing import Any
@@ -11,8 +10,9 @@ from xml.etree import ElementTree
 from softmode.deformables.build.cache import cache_directory, fingerprint_of, writable_cache
 from softmode.errors import AssetError, MissingExtraError, needs_extra
 from softmode.files import whole_file
+from softmode.foreign import process
 from softmode.robots.assets import RobotAsset
-from softmode.robots.references import resolve_inside, resolve_package
+from softmode.robots.references import check_count, resolve_inside, resolve_package
 
 _READ = (".stl", ".obj", ".msh")
 """Suffixes that MuJoCo reads."""
@@ -43,16 +43,26 @@ def use_meshes(tree: ElementTree.Element, asset: RobotAsset) -> list[str]:
         MissingExtraError: If a mesh that collides is a Collada file, and the package that reads those is missing.
     """
     left: dict[str, str] = {}
+    found: dict[str, str] = {}
+
+    def place(mesh: ElementTree.Element) -> None:
+        """Put the path of a file that MuJoCo reads into a mesh."""
+        name = mesh.get("filename", "")
+        if name not in found:
+            check_count(len(found) + 1, asset.path)
+            found[name] = str(_readable(_resolve(name, asset), asset))
+        mesh.set("filename", found[name])
+
     for link in tree.iter("link"):
         for mesh in link.findall("collision/geometry/mesh"):
-            mesh.set("filename", str(_readable(_resolve(mesh, asset), asset)))
+            place(mesh)
         for visual in link.findall("visual"):
             mesh = visual.find("geometry/mesh")
             if mesh is None:
                 continue
             name = mesh.get("filename", "")
             try:
-                mesh.set("filename", str(_readable(_resolve(mesh, asset), asset)))
+                place(mesh)
             except (AssetError, MissingExtraError) as error:
                 if name.lower().endswith(_READ) and not isinstance(error, _UnreadableError):
                     raise
@@ -62,7 +72,7 @@ def use_meshes(tree: ElementTree.Element, asset: RobotAsset) -> list[str]:
         return []
     names = ", ".join(Path(name).name for name in left)
     note = f"left out, as they are only seen and cannot be read: {names}; of the first: {next(iter(left.values()))}"
-    warnings.warn(f"robot file {asset.path}: meshes {note}", stacklevel=4)
+    warnings.warn(f"robot file {asset.path}: meshes {note}", stacklevel=6)
     return [note]
 
 
@@ -70,9 +80,8 @@ class _UnreadableError(AssetError):
     """A mesh that is there and cannot be read."""
 
 
-def _resolve(mesh: ElementTree.Element, asset: RobotAsset) -> Path:
+def _resolve(value: str, asset: RobotAsset) -> Path:
     """Return the file that a mesh of a URDF means."""
-    value = mesh.get("filename", "")
     if value.startswith("package://"):
         return resolve_package(value.removeprefix("package://"), asset.path, asset.asset_root, asset.root_given)
     return resolve_inside([value], [asset.path.parent], asset.asset_root, asset.path, "<mesh>")
@@ -112,26 +121,16 @@ def _read(file: Path, asset: RobotAsset) -> Any:
     """Return all surfaces of a file as one mesh, in the unit and the axes that robots take: metres, as they are."""
     import trimesh
 
-    suffix = file.suffix.lower()
-    if suffix == ".dae":
+    if file.suffix.lower() == ".dae":
         with needs_extra("robots", f"robot file {asset.path}: mesh {file} is a Collada file, which pycollada reads"):
             import collada  # noqa: F401  # pyright: ignore[reportMissingImports]
+    name = f"robot file {asset.path}: mesh {file}"
     try:
-        with file.open("rb") as source:  # without a place, so that it can refer to no other file
-            scene: Any = trimesh.load_scene(source, file_type=suffix[1:])
-        mesh = scene.to_mesh()
-        if suffix == ".dae":
-            mesh.apply_scale(_collada_unit(file))
-        faces = len(mesh.faces)
-    except Exception as error:  # its readers raise whatever a damaged file leads them to
-        text = f"robot file {asset.path}: mesh {file} cannot be read ({type(error).__name__}: {error})"
-        raise _UnreadableError(text, hint="export it again, or convert it to .stl or .obj") from error
-    if not faces:
-        raise _UnreadableError(f"robot file {asset.path}: mesh {file} holds no surface", hint="export it again")
+        with process.invalid_data(name):
+            points, faces = process.read("mesh", file, name=name, want="surface").arrays
+            mesh = trimesh.Trimesh(points, faces, process=False)
+    except AssetError as error:
+        raise _UnreadableError(error.message, hint="export it again, or convert it to .stl or .obj") from error
+    if not len(faces):
+        raise _UnreadableError(f"{name} holds no surface", hint="export it again")
     return mesh
-
-
-def _collada_unit(file: Path) -> float:
-    """Return the metres of a Collada file's unit. Its up axis is ignored, as other readers of robots do."""
-    found = re.search(rb"<unit\b[^>]*\bmeter\s*=\s*[\"']([0-9.eE+-]+)[\"']", file.read_bytes())
-    return float(found.group(1)) if found else 1.0

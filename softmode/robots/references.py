@@ -6,14 +6,23 @@ links wherever they lead, so every reference is resolved here first and refused 
 
 from __future__ import annotations
 
+import functools
 import os
+import re
 from pathlib import Path, PurePosixPath
 from xml.etree import ElementTree
 
 from softmode.errors import AssetError
+from softmode.foreign.child.layers import inside
 
 _SIZE_LIMIT = 64 * 2**20
 """Largest XML file that is read [bytes]."""
+_MARK_LIMIT = 500_000
+"""Most elements and attributes of a robot file and all that it includes: each takes a hundred bytes and more."""
+_DEPTH_LIMIT = 1000
+_REFERENCE_LIMIT = 4096
+"""Most references to files."""
+_NAN = re.compile(r"(?:^|\s)[+-]?nan\b", re.IGNORECASE)
 _FILE_ATTRIBUTES = ("file", "filename", "fileright", "fileleft", "fileup", "filedown", "filefront", "fileback")
 _TEXTURE_TAGS = ("texture",)
 _NESTED_TAGS = ("include", "model")
@@ -34,8 +43,14 @@ def read_xml(path: Path) -> ElementTree.Element:
         Its root element.
 
     Raises:
-        AssetError: If the file is missing, too large or no well-formed XML, or declares a document type.
+        AssetError: If the file is missing, too large or no well-formed XML, declares a document type, is nested too
+            deeply, or holds NaN.
     """
+    return _parse(path, _MARK_LIMIT)[0]
+
+
+def _parse(path: Path, left: int) -> tuple[ElementTree.Element, int]:
+    """Return the root element of a file, and how many elements and attributes it may have at most, `left` or fewer."""
     if not path.is_file():
         what = "is a folder" if path.is_dir() else "does not exist"
         raise AssetError(f"robot file {path} {what}", hint="give the path of an MJCF (.xml) or URDF (.urdf) file")
@@ -47,28 +62,48 @@ def read_xml(path: Path) -> ElementTree.Element:
         data = path.read_bytes()
     except OSError as error:
         raise AssetError(f"robot file {path} cannot be read: {error.strerror}", hint="check its permissions") from error
-    if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
-        raise AssetError(f"robot file {path} declares a document type", hint="remove its <!DOCTYPE>; none is needed")
+    if b"<!DOCTYPE" in data or b"<!ENTITY" in data or b"\0" in data:  # zeros: UTF-16, which may hide the others
+        hint = "remove its <!DOCTYPE>; none is needed, and save it as UTF-8"
+        raise AssetError(f"robot file {path} declares a document type, or is no UTF-8", hint=hint)
+    marks = data.count(b"<") + data.count(b"=")
+    if marks > left:
+        hint = f"at most {_MARK_LIMIT} elements and attributes are read, of all files together"
+        raise AssetError(f"robot file {path} has too many elements", hint=hint)
     try:
-        return ElementTree.fromstring(data)
+        tree = ElementTree.fromstring(data)
     except (ElementTree.ParseError, ValueError) as error:
         line = error.position[0] if isinstance(error, ElementTree.ParseError) else 1
         raise AssetError(f"robot file {path}, line {line}: {error}", hint="mend the XML at that line") from error
+    level, depth = [tree], 0
+    while level:
+        level, depth = [child for element in level for child in element], depth + 1
+        if depth > _DEPTH_LIMIT:
+            raise AssetError(f"robot file {path} is nested deeper than {_DEPTH_LIMIT} levels", hint="flatten it")
+    for element in tree.iter():
+        for name, value in element.attrib.items():
+            if "nan" in value.lower() and _NAN.search(value) and "name" not in name:  # MuJoCo reads it as nothing
+                text = f"robot file {path}: <{element.tag}> has {name}={value[:80]!r}"
+                raise AssetError(text, hint="give a number in place of NaN")
+    return tree, marks
 
 
-def check_references(path: Path, root: Path) -> None:
+def check_references(path: Path, root: Path) -> int:
     """Check that an MJCF file and all that it includes exist and lie in a folder, and so do their assets.
 
     Args:
         path: The file.
         root: The asset root. Symbolic links are followed before the comparison.
 
+    Returns:
+        The size of all files that it refers to [bytes].
+
     Raises:
         AssetError: If a reference leaves the folder or leads nowhere, or a file is broken.
     """
-    trees: list[tuple[Path, ElementTree.Element]] = []
+    trees: list[tuple[Path, ElementTree.Element, int]] = []
     _collect(path, path.parent, root, trees, ())
-    compilers = [element for _, tree in trees for element in tree.iter("compiler")]
+    files, count = {file for file, _, _ in trees}, 0
+    compilers = [element for _, tree, _ in trees for element in tree.iter("compiler")]
 
     def folders(*names: str) -> list[str]:
         found = [value for name in names for c in compilers if (value := c.get(name)) is not None]
@@ -76,7 +111,7 @@ def check_references(path: Path, root: Path) -> None:
 
     meshes, textures = folders("meshdir", "assetdir"), folders("texturedir", "assetdir", "meshdir")
     strip = any(compiler.get("strippath", "false").lower() == "true" for compiler in compilers)
-    for file, tree in trees:
+    for file, tree, _ in trees:
         for element in tree.iter():
             if element.tag in _NESTED_TAGS:
                 continue
@@ -88,7 +123,16 @@ def check_references(path: Path, root: Path) -> None:
                     value = PurePosixPath(value.replace("\\", "/")).name
                 places = textures if element.tag in _TEXTURE_TAGS else meshes
                 joined = [str(PurePosixPath(folder) / value) for folder in dict.fromkeys([*places, ""])]
-                resolve_inside(joined, [path.parent, file.parent], root, file, f"<{element.tag}>")
+                count += 1
+                check_count(count, path)
+                files.add(resolve_inside(joined, [path.parent, file.parent], root, file, f"<{element.tag}>"))
+    return sum(file.stat().st_size for file in files)
+
+
+def check_count(count: int, path: Path) -> None:
+    """Refuse a robot file that refers to too many files."""
+    if count > _REFERENCE_LIMIT:
+        raise AssetError(f"robot file {path} refers to more than {_REFERENCE_LIMIT} files", hint="flatten the model")
 
 
 def resolve_inside(values: list[str], bases: list[Path], root: Path, file: Path, tag: str) -> Path:
@@ -104,11 +148,10 @@ def resolve_inside(values: list[str], bases: list[Path], root: Path, file: Path,
         )
     if any(PurePosixPath(value).is_absolute() or "\\" in value or ":" in value for value in values):
         raise AssetError(f"{file}: {tag} refers to {asked!r}", hint="use a relative path with forward slashes")
-    inside = root.resolve()
     candidates = [(base / value).resolve() for value in values for base in dict.fromkeys(bases)]
     # What an importer would open is the first that exists, whichever rule it follows: none of them may be outside.
     existing = [candidate for candidate in candidates if candidate.exists()]
-    outside = [candidate for candidate in existing or candidates if not candidate.is_relative_to(inside)]
+    outside = [candidate for candidate in existing or candidates if not inside(str(candidate), str(root))]
     if outside:
         hint = (
             f"copy the file into the folder, or pass asset_root={_common(file, outside) or 'the folder of the robot'}"
@@ -118,14 +161,16 @@ def resolve_inside(values: list[str], bases: list[Path], root: Path, file: Path,
         found = next((up for up in list(file.resolve().parents)[:6] for value in values if (up / value).exists()), None)
         hint = f"pass asset_root={found}" if found else "put the file in its place, or pass asset_root= its folder"
         raise AssetError(f"{file}: {tag} refers to {asked!r}, which does not exist in {root}", hint=hint)
+    if not existing[0].is_file():
+        raise AssetError(f"{file}: {tag} refers to {asked!r}, which is no file", hint="name a file")
     return existing[0]
 
 
 def resolve_package(whole: str, file: Path, root: Path, given: bool) -> Path:
     """Return the file that a reference `package://NAME/PATH` means.
 
-    It is looked for in the asset root, and in the folder of the package: one called NAME above the file or beside what
-    lies above it, or the one above whose `package.xml` has that name.
+    It is looked for in the asset root, and in the folder of the package: one above the file or beside what lies above
+    it, whose `package.xml` has that name.
 
     Args:
         whole: What stands behind `package://`.
@@ -152,8 +197,7 @@ def package_folder(name: str, rest: str, file: Path) -> Path | None:
         return None
     for up in list(file.resolve().parents)[:_LEVELS]:
         for folder in (up / name, up):
-            named = folder.name == name or _package_name(folder) == name
-            if named and (folder / rest).exists():
+            if _package_name(folder) == name and (folder / rest).exists():
                 return folder
     return None
 
@@ -167,8 +211,14 @@ def default_root(file: Path) -> Path:
 def _package_name(folder: Path) -> str | None:
     """Return the name that a folder's package.xml says."""
     file = folder / "package.xml"
+    return _named(file, file.stat().st_mtime_ns) if file.is_file() else None
+
+
+@functools.lru_cache(64)
+def _named(file: Path, _: int) -> str | None:
+    """Return the name that a package.xml of some time says."""
     try:
-        name = read_xml(file).findtext("name") if file.is_file() else None
+        name = read_xml(file).findtext("name")
     except AssetError:
         return None
     return None if name is None else name.strip()
@@ -181,14 +231,14 @@ def _common(file: Path, outside: list[Path]) -> Path | None:
 
 
 def _collect(
-    file: Path, main: Path, root: Path, trees: list[tuple[Path, ElementTree.Element]], above: tuple[Path, ...]
+    file: Path, main: Path, root: Path, trees: list[tuple[Path, ElementTree.Element, int]], above: tuple[Path, ...]
 ) -> None:
     """Append a file and what it includes, with their elements."""
     real = file.resolve()
     if real in above:
         raise AssetError(f"{file} includes itself", hint="break the circle of <include> elements")
-    tree = read_xml(file)
-    trees.append((file, tree))
+    tree, marks = _parse(file, _MARK_LIMIT - sum(marks for _, _, marks in trees))
+    trees.append((file, tree, marks))
     if len(trees) > 1000:
         raise AssetError(f"{file} includes more than 1000 files", hint="flatten the model")
     for tag in _NESTED_TAGS:

@@ -1,6 +1,6 @@
 """A robot of an OpenUSD stage as a MuJoCo specification: Newton's importer reads UsdPhysics, this turns its result.
 
-The stage is opened in a process of its own, see :mod:`softmode.stages.process`; what Newton reads is the checked crate
+The stage is opened in a process of its own, see :mod:`softmode.foreign.process`; what Newton reads is the checked crate
 that comes back. Newton resolves the schemas (UsdPhysics, and Newton's, PhysX' and MuJoCo's own attributes), units and
 axes; each of its joints becomes hinges and slides of a link, each loop a constraint, each drive an affine actuator.
 
@@ -28,8 +28,8 @@ from scipy.spatial.transform import Rotation
 from softmode.deformables.build.cache import cache_directory, fingerprint_of, writable_cache
 from softmode.errors import AssetError, SoftmodeError, needs_extra
 from softmode.files import whole_file
+from softmode.foreign import process
 from softmode.robots.assets import RobotAsset
-from softmode.stages import process
 
 Array = NDArray[np.float64]
 _UNLIMITED = 1.0e6
@@ -59,10 +59,9 @@ def read_stage(asset: RobotAsset) -> tuple[Any, list[str]]:
     """
     name = f"robot file {asset.path}"
     with tempfile.TemporaryDirectory() as folder:
-        answer, crate = os.path.join(folder, "answer"), os.path.join(folder, "robot.usdc")
+        crate = os.path.join(folder, "robot.usdc")
         root = asset.asset_root if asset.root_given else None
-        request = process.make_request("robot", asset.path, answer, asset_root=root, limits=process.Limits())
-        said = process.ask(request | {"copy": crate, "strict": True}, name=name).described
+        said = process.read("robot", asset.path, name=name, asset_root=root, copy=crate, strict=True).described
         scene, notes = _import(crate, name)
     for schema, there in (("RigidBodyAPI", scene.body_count), ("ArticulationRootAPI", said["articulations"])):
         if not there:
@@ -125,7 +124,7 @@ class _Translation:
         """Return the specification.
 
         Args:
-            said: The answer of `softmode.stages.child.robot`.
+            said: The answer of `softmode.foreign.child.robot`.
         """
         scene = self.scene
         tree = [j for j in range(scene.joint_count) if scene.joint_articulation[j] >= 0]

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from softmode.errors import AssetError
+from softmode.foreign.child.surface import GREY as GREY
+from softmode.foreign.child.surface import gathered
+from softmode.foreign.process import invalid_data
 
 if TYPE_CHECKING:
     import trimesh
-    from PIL import Image
-
-GREY = 0.6
-"""Colour of a mesh that names none; gamma-encoded."""
-
-_TEXEL_LIMIT = 2**26
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -63,38 +60,10 @@ class ColoredMesh:
             name: Where it comes from; used in messages.
 
         Raises:
-            AssetError: If there are no triangles, they have no area, or a number is not finite.
+            AssetError: If there are no triangles, they have no area, a number is not finite, or a part is damaged.
         """
-        import trimesh
-
-        parts: list[tuple[Any, NDArray[np.float64]]] = [(source, np.eye(4))]
-        if isinstance(source, trimesh.Scene):
-            nodes = [source.graph[node] for node in source.graph.nodes_geometry]
-            parts = [(source.geometry[key], np.asarray(transform)) for transform, key in nodes]
-        gathered, textures, known = [], [], {}
-        for mesh, transform in parts:
-            if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
-                continue
-            faces = np.asarray(mesh.faces)
-            placed = np.asarray(mesh.vertices) @ transform[:3, :3].T + transform[:3, 3]
-            color, uv, image = _appearance(mesh, name)
-            chosen = -1
-            if image is not None:
-                chosen = known.setdefault(id(image), len(textures))
-                if chosen == len(textures):
-                    textures.append(_pixels(image, name))
-            gathered.append((placed[faces], color, uv, np.full(len(faces), chosen)))
-        if not gathered:
-            raise AssetError(f"{name}: holds no triangles", hint="Export a triangle mesh, not points or curves")
-        corners, colors, uvs, index = (np.concatenate(arrays) for arrays in zip(*gathered, strict=True))
-        return cls(
-            corners=corners.astype(np.float32),
-            corner_colors=colors.astype(np.float32),
-            corner_uvs=uvs.astype(np.float32),
-            texture_index=index.astype(np.int32),
-            textures=tuple(textures),
-            name=name,
-        )
+        with invalid_data(name):
+            return cls(**gathered(source), name=name)
 
     @property
     def area(self) -> float:
@@ -131,71 +100,6 @@ class ColoredMesh:
             here = self.texture_index[face] == i
             color[here] *= _bilinear(texture, uv[here])
         return color
-
-
-def _appearance(mesh: Any, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64], Any]:
-    """Return corner colours (F, 3, 3), corner texture coordinates (F, 3, 2) and the image or None."""
-    faces = np.asarray(mesh.faces)
-    color, uv, image = np.ones((len(faces), 3, 3)), np.zeros((len(faces), 3, 2)), None
-    visual = mesh.visual
-    if visual.kind == "vertex":
-        color = np.asarray(visual.vertex_colors)[faces][..., :3] / 255.0
-    elif visual.kind == "face":
-        color = np.repeat(np.asarray(visual.face_colors)[:, None, :3] / 255.0, 3, axis=1)
-    elif visual.kind == "texture":
-        material = visual.material
-        factor = getattr(material, "baseColorFactor", None)
-        if hasattr(material, "baseColorTexture"):
-            image = material.baseColorTexture
-            if factor is not None:
-                color *= _gamma_encoded(np.asarray(factor)[:3] / 255.0)
-            vertex = visual.vertex_attributes.get("color") if hasattr(visual, "vertex_attributes") else None
-            if vertex is not None and len(vertex) == len(mesh.vertices):
-                color *= _unit(vertex)[faces][..., :3]
-            if image is None and factor is None and vertex is None:
-                color *= GREY
-        else:
-            image = getattr(material, "image", None)
-            if image is None:
-                color *= np.asarray(material.diffuse)[:3] / 255.0
-        if image is not None and visual.uv is None:
-            image = None
-        if image is not None:
-            uv = np.asarray(visual.uv, dtype=np.float64)
-            if uv.shape != (len(mesh.vertices), 2):
-                raise AssetError(
-                    f"{name}: texture coordinates have shape {uv.shape}, expected ({len(mesh.vertices)}, 2)",
-                    hint="Export the mesh again",
-                )
-            uv = uv[faces]
-    else:
-        color *= GREY
-    return color, uv, image
-
-
-def _unit(values: ArrayLike) -> NDArray[np.float64]:
-    """Return colours stored as integers or as numbers of 0..1, as the latter."""
-    array = np.asarray(values)
-    scale = np.iinfo(array.dtype).max if np.issubdtype(array.dtype, np.integer) else 1.0
-    return array.astype(np.float64) / scale
-
-
-def _gamma_encoded(linear: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the sRGB code values 0..1 of linear light (IEC 61966-2-1)."""
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055)
-
-
-def _pixels(image: Image.Image, name: str) -> NDArray[np.uint8]:
-    """Decode an image, bounded."""
-    if image.width * image.height > _TEXEL_LIMIT:
-        raise AssetError(
-            f"{name}: a texture of {image.width} x {image.height} px, at most {_TEXEL_LIMIT} px",
-            hint="Scale the texture down: splats of this size cannot show it",
-        )
-    try:
-        return np.ascontiguousarray(np.asarray(image.convert("RGB"), dtype=np.uint8))
-    except (OSError, ValueError, SyntaxError) as error:
-        raise AssetError(f"{name}: a texture cannot be decoded ({error})", hint="Export the mesh again") from error
 
 
 def _bilinear(texture: NDArray[np.uint8], uv: NDArray[np.float64]) -> NDArray[np.float64]:

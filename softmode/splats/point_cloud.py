@@ -11,6 +11,7 @@ from scipy.spatial import KDTree
 
 from softmode.errors import AssetError
 from softmode.files import read_arrays, require_content
+from softmode.foreign import process
 from softmode.splats.formats.common import sh_from_colors
 from softmode.splats.mesh_samples import frames_of
 from softmode.splats.splats import MAX_SPLATS, Splats, quats_from_rotations
@@ -69,15 +70,8 @@ def read_points(path: str | os.PathLike[str]) -> Splats:
         if "points" not in arrays:
             raise AssetError(f"{name}: holds no points", hint=_HINT)
         return splats_from_points(arrays["points"], arrays.get("normals"), arrays.get("colors"), name=name)
-    import trimesh
-
-    try:
-        cloud = trimesh.load(file)
-        points = np.asarray(cloud.vertices)  # type: ignore[attr-defined]
-        colors = np.asarray(getattr(cloud, "colors", np.zeros((0, 4))))
-    except Exception as error:  # its readers raise whatever a damaged file leads them to
-        raise AssetError(f"{name}: cannot be read ({type(error).__name__}: {error})", hint=_HINT) from error
-    return splats_from_points(points, None, colors[:, :3] if len(colors) == len(points) else None, name=name)
+    points, *colors = process.read("mesh", file, name=name, want="points").arrays
+    return splats_from_points(points, None, *colors, name=name)
 
 
 def splats_from_points(

@@ -10,7 +10,7 @@ from typing import Any
 
 from softmode.errors import ConfigError, MissingExtraError
 from softmode.files import PendingFile, check_place
-from softmode.stages.openusd import pxr
+from softmode.foreign.openusd import pxr
 
 SUFFIXES = (".usdc", ".usd", ".usda")
 """What can be written: binary, binary, text."""

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softmode.errors import AssetError, ConfigError
+from softmode.foreign import process
 from softmode.objects.soft_object import SoftObject
 from softmode.objects.stage_bundle import body_of
 from softmode.scenes.binding import splats_of_states
 from softmode.splats.formats.usd import splats_from_prim
 from softmode.splats.splats import MAX_SPLATS, Splats
-from softmode.stages import process
 from softmode.usd.dents import NO_DENTS, Dents
 from softmode.usd.handles import coordinates_from_handles, world_coordinates
 

@@ -8,9 +8,9 @@ import newton
 import numpy as np
 from numpy.typing import NDArray
 
+from softmode.foreign.openusd import Stage
 from softmode.scenes.meshes import SceneMesh, scene_meshes
 from softmode.splats.splats import rotations_from_quats
-from softmode.stages.openusd import Stage
 from softmode.usd.openusd import openusd
 from softmode.usd.writer import prim_name, set_place, vectors
 

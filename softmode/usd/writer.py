@@ -25,12 +25,12 @@ from numpy.typing import NDArray
 from softmode.checks import require_choice
 from softmode.deformables.materials.material import Material
 from softmode.errors import ConfigError
+from softmode.foreign import tokens
+from softmode.foreign.openusd import Layer, Prim, Stage, Value
 from softmode.objects.placed import Placed
 from softmode.objects.stage_bundle import DTYPES, encode_body
 from softmode.splats.formats.usd import define_splats, set_splat_column, splat_columns
 from softmode.splats.splats import quats_from_rotations
-from softmode.stages import tokens
-from softmode.stages.openusd import Layer, Prim, Stage, Value
 from softmode.usd import kaolin
 from softmode.usd.handles import handle_weights
 from softmode.usd.openusd import openusd, whole_stage

@@ -108,11 +108,15 @@ def test_unreadable(name, data, words, tmp_path) -> None:
 
 @pytest.mark.filterwarnings("ignore:robot file:UserWarning")
 def test_package_by_its_name(tmp_path) -> None:
-    """A package is the folder of its name above the file or beside what is above, or the one that package.xml names."""
+    """A package lies in the robot's own or a named root, or is the folder whose package.xml has its name: not any."""
     path = write_urdf(tmp_path)
     assert robots.load(path).gripper is not None
     (path.parent / "deep").mkdir()
     path = path.rename(path.parent / "deep" / path.name)
+    with pytest.raises(AssetError, match="asset_root"):  # the folder above is called so, which says nothing
+        robots.load(path)
+    assert robots.load(path, asset_root=tmp_path).gripper is not None
+    (tmp_path / "lifter" / "package.xml").write_text("<package><name>lifter</name></package>")
     assert robots.load(path).gripper is not None
     path.write_text(URDF.replace("package://lifter", "package://lifter_description"))
     with pytest.raises(AssetError, match="asset_root"):

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from softmode.errors import AssetError, ConfigError, MissingExtraError, StorageError
+from softmode.foreign import process
 from softmode.splats import Splats, read_splats, write_splats, write_usd
 from softmode.splats.formats import read_usd
 from softmode.splats.splats import sh_basis, up_rotation
-from softmode.stages import process
 from tests.splats.test_splats import random_splats
 
 pytest.importorskip("pxr", reason="needs the extra [usd]")
@@ -280,7 +280,8 @@ def test_a_broken_installation_is_not_blamed_on_the_file(tmp_path: Path, monkeyp
     (tmp_path / "a.usda").write_text("#usda 1.0\n")
     (tmp_path / "pxr").mkdir()
     (tmp_path / "pxr" / "__init__.py").touch()
-    monkeypatch.setattr(process, "pxr_folder", lambda: str(tmp_path))
+    process._stop()  # the one that is kept has loaded OpenUSD
+    monkeypatch.setattr(process, "library_folder", lambda _: str(tmp_path))
     with pytest.raises(AssetError, match=r"No module named .pxr\.Sdf."):
         read_splats(tmp_path / "a.usda")
 

@@ -18,8 +18,6 @@ from softmode.usd import write_usd
 from tests.usd.export_scenes import assert_same, assert_same_splats, small_body, small_splats
 from tests.usd.stages import EDGES, Author, Gf, UsdGeom, UsdVol, box, shell, transform
 
-pytestmark = pytest.mark.usefixtures("forked")
-
 SMALL = BuildOptions(mode_count=3, kernel_count=120, cubature_count=128)
 
 

@@ -34,8 +34,6 @@ from tests.usd.export_scenes import (
 )
 from tests.usd.stages import Author
 
-pytestmark = pytest.mark.usefixtures("forked")
-
 Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade = (
     importlib.import_module(f"pxr.{name}") for name in ("Gf", "Sdf", "Usd", "UsdGeom", "UsdPhysics", "UsdShade")
 )

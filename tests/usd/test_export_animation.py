@@ -17,12 +17,12 @@ import warp as wp
 
 from softmode.deformables.model.authoring import add_reduced_body
 from softmode.errors import AssetError, ConfigError, SolverDiverged, StorageError
+from softmode.foreign import process
 from softmode.objects import Placed, SoftObject
 from softmode.scenes import BoundSplats
 from softmode.splats.formats import read_usd
 from softmode.splats.pinhole import PinholeCamera
 from softmode.splats.splats import rotations_from_quats
-from softmode.stages import process
 from softmode.usd import (
     UsdAnimation,
     UsdAnimationOptions,
@@ -43,8 +43,6 @@ from tests.usd.export_scenes import (
     some_state,
 )
 from tests.usd.test_damage import mutate
-
-pytestmark = pytest.mark.usefixtures("forked")
 
 pytest.importorskip("pxr", reason="needs the extra [usd]")
 Gf, Usd, UsdGeom = (importlib.import_module(f"pxr.{name}") for name in ("Gf", "Usd", "UsdGeom"))
@@ -407,15 +405,10 @@ def test_damaged_animations(tmp_path: Path) -> None:
         path = tmp_path / f"{trial}.usd"
         path.write_bytes(mutate(valid[trial % 2], np.random.default_rng(trial)))
         requests.append(animation_request(path, str(tmp_path / f"answer_{trial}")))
-    (tmp_path / "requests.json").write_text(json.dumps(requests))
-    subprocess.run([sys.executable, "-m", "tests.usd.fork_server", str(tmp_path / "requests.json")], check=True)
     refused = 0
     for request in requests:
-        code = int(Path(request["answer"] + ".code").read_text())
         try:
-            if code:
-                raise process.refusal(code, Path(request["answer"] + ".errors").read_text(errors="replace"), "file")
-            found = animation_from_answer(process.read_answer(request["answer"], "file"), "file")
+            found = animation_from_answer(process.ask(request, name="file"), "file")
             for played in found.bodies:
                 assert np.isfinite(played.coordinates).all() and np.isfinite(played.times).all()
                 assert_same(played.object.body, small_body("affine"))

@@ -17,8 +17,6 @@ from softmode.splats.formats import read_usd
 from softmode.usd import UsdAnimation, read_animation
 from softmode.usd.openusd import openusd
 
-pytestmark = pytest.mark.usefixtures("forked")
-
 pytest.importorskip("pxr", reason="needs the extra [usd]")
 PLAY = ["play", "softmode/LiftSoft-v0", "--policy", "random"]
 

@@ -30,13 +30,11 @@ from softmode.deformables.model.status import status_reasons
 from softmode.deformables.skinning.skin_splats import SkinSplats
 from softmode.deformables.solver.solver_reduced import SolverReduced
 from softmode.errors import AssetError, ConfigError, MissingExtraError
+from softmode.foreign import process
 from softmode.splats.rasterizer import SplatArrays
-from softmode.stages import process
 from softmode.usd import add_usd, read_usd_scene
 from tests.marks import rest_but
 from tests.usd.stages import KINDS, Author, Gf, Sdf, UsdGeom, UsdPhysics, UsdShade, UsdVol, box, shell, transform
-
-pytestmark = pytest.mark.usefixtures("forked")
 
 EPSILON = float(np.finfo(np.float32).eps)
 SMALL = BuildOptions(mode_count=3, kernel_count=120, cubature_count=128)

@@ -11,8 +11,8 @@ import pytest
 pytest.importorskip("pxr", reason="needs the extra [usd]")
 
 from softmode.errors import AssetError
+from softmode.foreign.child.layers import MAX_LAYERS
 from softmode.splats import read_splats
-from softmode.stages.child.layers import MAX_LAYERS
 from softmode.usd import read_usd_scene
 from tests.usd.stages import Author, Sdf, UsdUtils, UsdVol, shell
 

@@ -17,8 +17,6 @@ from softmode.objects.stage_body import build_deformable
 from softmode.usd import read_usd_scene
 from tests.usd.stages import EDGES, FAMILIES, KINDS, MATERIAL, Author, Sdf, UsdGeom, UsdShade, UsdVol, shell, transform
 
-pytestmark = pytest.mark.usefixtures("forked")
-
 EPSILON = float(np.finfo(np.float32).eps)
 VOLUME = float(np.prod(EDGES))
 COARSE = {"Mesh": 1e-6, "TetMesh": 1e-6, "Points": 0.03, "ParticleField3DGaussianSplat": 0.08}

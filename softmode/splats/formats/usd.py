@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 from softmode.checks import require_number
 from softmode.errors import AssetError, ConfigError, MissingExtraError
 from softmode.files import whole_file
+from softmode.foreign import process
+from softmode.foreign.openusd import pxr
 from softmode.splats.formats.common import REEXPORT, typed_errors, unreadable
 from softmode.splats.splats import MAX_SPLATS, Splats, UpAxis, joined, rotate_sh, up_rotation
-from softmode.stages import process
-from softmode.stages.openusd import pxr
 
 _LIMITS = process.Limits(memory=128 * 2.0**20, memory_per_byte=16.0, seconds=1.0)
 """Splats alone need little: 16 bytes for each of the file is generous."""
@@ -175,7 +175,7 @@ def write_usd(path: str | os.PathLike[str], splats: Splats | Sequence[Splats], *
     suffix = Path(path).suffix.lower()
     if suffix not in (".usd", ".usda", ".usdc"):
         raise unreadable(path, f"cannot write {suffix!r}", hint="Name a .usdc, .usda or .usd file")
-    process.pxr_folder()
+    process.library_folder()
     with whole_file(path, "splat file", make_folders=False) as file, tempfile.TemporaryDirectory() as folder:
         scratch = os.path.join(folder, "splats" + suffix)
         if not _build_layer(frames, fps).Export(scratch):

@@ -1,4 +1,4 @@
-"""Answer one request: open the stage under limits, read what is asked for, write JSON and raw arrays to a file."""
+"""Answer one request: open the file under limits, read what is asked for, write JSON and raw arrays to a file."""
 
 from __future__ import annotations
 
@@ -34,36 +34,45 @@ class Arrays:
 
 def load(request: dict[str, Any]) -> None:
     """Import what the request needs: loading it shall not count against the limits."""
-    modules = ["Sdf", "Usd", "UsdGeom"]
-    if request["what"] in ("scene", "asset", "robot"):
-        modules += ["UsdPhysics", "UsdShade"]
-        importlib.import_module("numpy")
-    for module in modules:
-        importlib.import_module(f"pxr.{module}")
+    if request["place"] not in sys.path:
+        sys.path.insert(0, request["place"])
+    if request["library"] == "pxr":
+        modules = ["Sdf", "Usd", "UsdGeom"]
+        if request["what"] in ("scene", "asset", "robot"):
+            modules += ["UsdPhysics", "UsdShade"]
+            importlib.import_module("numpy")
+        for module in modules:
+            importlib.import_module(f"pxr.{module}")
+    for module in ("pyarrow.parquet", "pyarrow.ipc") if request["library"] == "pyarrow" else (request["library"],):
+        importlib.import_module(module)
     importlib.import_module(f".{request['what']}", __package__)
 
 
 def answer(request: dict[str, Any]) -> int:
-    """Answer a request; return the exit code: 0, or 3 with the reason on the standard error."""
+    """Answer a request; return the exit code: 0, 3 with the reason on the standard error, or 4 for lack of memory."""
     try:
         budget = Budget(**request["limits"])
         path = request["file"]
-        budget.add(os.stat(path).st_size)
-        stage = open_stage(path, request["root"], budget, request["strict"])
+        budget.add(os.stat(path).st_size + request.get("size", 0))
+        stages = request["library"] == "pxr"
+        source = open_stage(path, request["root"], budget, request["strict"]) if stages else budget
         arrays = Arrays()
         reader = importlib.import_module(f".{request['what']}", __package__)
-        described = reader.read(stage, request, arrays)
+        described = reader.read(source, request, arrays)
         described["arrays"] = arrays.described
         with open(request["answer"], "wb") as out:
             out.write(json.dumps(described).encode("ascii") + b"\n")
             for array in arrays.values:
                 out.write(memoryview(array).cast("B"))
-    except Exception as error:  # every failure of OpenUSD is an answer about the file
+    except MemoryError:
+        return 4
+    except Exception as error:  # every failure of a library is an answer about the file
         try:
             said = " ".join(str(error).split())
         except UnicodeDecodeError:  # OpenUSD quotes what it read
             said = ""
-        reason = {"reason": said[:600] or type(error).__name__, "hint": getattr(error, "hint", "")}
+        kind = "" if isinstance(error, Refused) or request["library"] == "pxr" else f"{type(error).__name__}: "
+        reason = {"reason": kind + said[:600] or type(error).__name__, "hint": getattr(error, "hint", "")}
         sys.stderr.write(f"\nanswer: {json.dumps(reason)}\n")
         sys.stderr.flush()
         return 3
