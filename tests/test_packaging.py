@@ -62,7 +62,7 @@ def _contents(wheel: Path) -> dict[str, bytes]:
 
 
 def test_wheel_holds_the_package_and_nothing_else(dist: Path) -> None:
-    """The package and the plug-in of pytest; all modules, templates, the marker of types, the licence; no tests, assets or caches."""
+    """Package and plug-in of pytest: all modules, templates, the marker of types, the licence; no tests or caches."""
     (wheel,) = dist.glob("*.whl")
     names = set(_contents(wheel))
     info = f"softmode-{softmode.__version__}.dist-info"
