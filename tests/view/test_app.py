@@ -278,16 +278,6 @@ def test_pages_of_others_are_refused(view: Served) -> None:
         assert len(client.receive(5.0)[0])
 
 
-def test_nobody_can_ask_for_a_public_address(view: Served) -> None:
-    """Viser's message that opens a tunnel to a public server does nothing."""
-    with PageClient(view.app.url) as client:
-        client.send({"type": "ShareUrlRequest"})
-        for _ in range(10):
-            kinds = [message["type"] for message in client.receive(5.0)[0]]
-            assert not [kind for kind in kinds if "ShareUrl" in kind]
-    assert view.app._server._share_tunnel is None
-
-
 def test_only_this_machine_by_default(view: Served) -> None:
     """The socket is bound to 127.0.0.1."""
     assert ViewOptions().host == "127.0.0.1"

@@ -89,6 +89,8 @@ def test_one_client_cannot_spoil_the_page_of_another(
     """Garbage, foreign fields, values, uploads, turns go nowhere, with a line for each kind; values that fit go on."""
     from websockets.exceptions import ConnectionClosed
 
+    taken: list[float] = []
+    page.slider.on_update(lambda _: taken.append(page.slider.value))
     with PageClient(page.url) as watching, PageClient(page.url) as other:
         for _ in range(3):
             other.socket.send("text")
@@ -126,7 +128,7 @@ def test_one_client_cannot_spoil_the_page_of_another(
         values = {one["uuid"]: one["updates"] for one in changes}
         handles = (page.box, page.choice, page.slider)
         assert values == {one._impl.uuid: {"value": one.value} for one in handles} and len(changes) == 3
-        assert [one.value for one in handles] == [True, "b", 2.0]
+        assert [one.value for one in handles] == [True, "b", 2.0] and taken == [2.0]
         other.socket.send(bytes(1_000_000))
         with pytest.raises(ConnectionClosed) as caught:
             while True:
