@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import inspect
 import re
+import types
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -57,7 +58,7 @@ def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", f"softmode_episodes{_MARKER}")
     if config.getini(_SHORT):
         config.addinivalue_line("markers", f"episodes{_MARKER}")
-        config.pluginmanager.register(_ShortNames(), _SHORT)
+        config.pluginmanager.register(_short_names(), _SHORT)
 
 
 # -- fixtures ---------------------------------------------------------------------------------------------------------
@@ -134,23 +135,24 @@ def softmode_golden(request: pytest.FixtureRequest) -> Callable[..., None]:
     return check
 
 
-class _ShortNames:
-    """The fixtures by their short names."""
+def _short_names() -> types.ModuleType:
+    """Return a plug-in that has the fixtures by their short names."""
 
     @pytest.fixture(scope="session")
-    def soft_env(self, softmode_env: Callable[..., gym.Env]) -> Callable[..., gym.Env]:
-        """Return `softmode_env`."""
+    def soft_env(softmode_env: Callable[..., gym.Env]) -> Callable[..., gym.Env]:
         return softmode_env
 
     @pytest.fixture
-    def episode(self, softmode_episode: Episodes) -> Episodes:
-        """Return `softmode_episode`."""
+    def episode(softmode_episode: Episodes) -> Episodes:
         return softmode_episode
 
     @pytest.fixture
-    def golden(self, softmode_golden: Callable[..., None]) -> Callable[..., None]:
-        """Return `softmode_golden`."""
+    def golden(softmode_golden: Callable[..., None]) -> Callable[..., None]:
         return softmode_golden
+
+    plugin = types.ModuleType(_SHORT)
+    vars(plugin).update(soft_env=soft_env, episode=episode, golden=golden)
+    return plugin
 
 
 def _made(env: str, given: dict[str, Any]) -> gym.Env:

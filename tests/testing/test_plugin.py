@@ -100,6 +100,9 @@ def test_proven(episode):
 def test_not_proven(episode):
     coin(episode, [7])
 
+def test_short(soft_env, golden):
+    pass
+
 @pytest.mark.episodes(3)
 def test_all(episode):
     coin(episode, [2])
@@ -125,8 +128,8 @@ def test_the_marker_judges_by_wilsons_interval(installed: pytest.Pytester) -> No
     """
     installed.makeini("[pytest]\nsoftmode_short_names = true")
     installed.makepyfile(MARKED)
-    result = installed.runpytest_subprocess("--strict-markers")
-    result.assert_outcomes(passed=2, failed=6)
+    result = installed.runpytest_subprocess("--strict-markers", "-W", "error")
+    result.assert_outcomes(passed=3, failed=6)
     result.stdout.fnmatch_lines(
         [
             "15 of 20 episodes succeeded (95 %: 53.1% to 88.8%, wanted 90.0%)",
