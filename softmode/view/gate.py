@@ -35,7 +35,7 @@ _Point = tuple[_Number, _Number, _Number]
 _Turn = tuple[_Number, _Number, _Number, _Number]
 _Value = msgspec.defstruct("_Value", [("value", bool | _Number | _Text)], forbid_unknown_fields=True)
 _NODE = {"name": _Text, "owner": _Text}
-_PICKED = _NODE | {"instance_index": int | None, "modifier": _Text | None}
+_PICKED = _NODE | {"instance_index": int | None, "modifier": _Text | None}  # pyright: ignore[reportOperatorIssue]
 _FIELDS: dict[str, dict[str, Any]] = {
     "ViewerCameraMessage": {"wxyz": _Turn}
     | dict.fromkeys(("fov", "near", "far", "image_height", "image_width"), _Number)
@@ -143,7 +143,7 @@ class Gate:
     def checked(self, raw: bytes | str) -> bytes | None:
         """Return a message as viser may have it, None for one that it may not."""
         try:
-            message = _DECODER.decode(raw if isinstance(raw, bytes) else b"")
+            message: Any = _DECODER.decode(raw if isinstance(raw, bytes) else b"")
         except (msgspec.MsgspecError, UnicodeError, RecursionError):
             return self.tell("a message that no page of softmode's sends")
         if hasattr(message, "updates"):
