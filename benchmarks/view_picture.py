@@ -28,7 +28,7 @@ def main() -> None:
     with served(ObjectConfig(size=0.12), frame_rate=3.0) as view, sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
         page = browser.new_page(viewport={"width": SIZE[0], "height": SIZE[1]})
-        page.goto(f"{view.app.url}/?fixedDpr=1")
+        page.goto(f"{view.app.url}?fixedDpr=1")
         page.locator(".mantine-Notification-closeButton").first.click(timeout=120_000)
         time.sleep(15.0)  # the page fades in
         camera = next(iter(view.app._server.get_clients().values())).camera

@@ -31,7 +31,7 @@ if _BODIES.name != (_NAME := f"tests-{sources_hash()}"):  # as a process of this
 # softmode's plug-in registers itself where softmode is installed, and not where a checkout is on the path alone.
 pytest_plugins = ["pytester", "tests.processor_seconds"]
 if not entry_points(group="pytest11", name="softmode"):
-    pytest_plugins.append("softmode.testing.plugin")
+    pytest_plugins.append("pytest_softmode")
 
 _FAST = {
     "deformables/test_adjoint.py": "gradient_by_a_parameter",

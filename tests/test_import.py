@@ -25,7 +25,7 @@ HEAVY = (
 SCRIPT = f"""
 import sys
 before = set(sys.modules)
-import softmode, softmode.cli.main, softmode.errors, softmode.testing.plugin
+import softmode, softmode.cli.main, softmode.errors, softmode.testing
 loaded = sorted(set({HEAVY!r}) & {{name.partition(".")[0] for name in set(sys.modules) - before}})
 assert not loaded, loaded
 import gymnasium

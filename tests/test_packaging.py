@@ -62,11 +62,11 @@ def _contents(wheel: Path) -> dict[str, bytes]:
 
 
 def test_wheel_holds_the_package_and_nothing_else(dist: Path) -> None:
-    """One top-level name; all modules, templates, the marker of types, the licence; no tests, assets or caches."""
+    """Package and plug-in of pytest: all modules, templates, the marker of types, the licence; no tests or caches."""
     (wheel,) = dist.glob("*.whl")
     names = set(_contents(wheel))
     info = f"softmode-{softmode.__version__}.dist-info"
-    assert {name.partition("/")[0] for name in names} == {"softmode", info}
+    assert {name.partition("/")[0] for name in names} == {"softmode", "pytest_softmode.py", info}
     modules = {str(path.relative_to(ROOT)) for path in (ROOT / "softmode").rglob("*.py")}
     templates = {str(path.relative_to(ROOT)) for path in (ROOT / "softmode/cli/templates").rglob("*.txt")}
     assert {name for name in names if name.startswith("softmode/")} == modules | templates | {"softmode/py.typed"}

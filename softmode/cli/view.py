@@ -49,7 +49,7 @@ class View:
     seed: int = 0
     """Seed of an environment's first episode."""
     host: str = "127.0.0.1"
-    """Address to listen at. Anyone who reaches it may drive the session; the default is this machine alone."""
+    """Address to listen at; the default is this machine alone. Whoever has the page's address drives the session."""
     port: int = 8080
     """Port to listen at; 0 for any free one."""
     open: bool = True
@@ -93,8 +93,8 @@ def _serve(options: View, session: LiveSession, served: ViewOptions) -> bool:
             print(f"softmode: open {app.url} in a browser; Ctrl-C ends it", flush=True)
             if not served.is_local:
                 print(
-                    f"softmode: warning: listening at {options.host}: anyone who reaches port "
-                    f"{app.url.rpartition(':')[2]} of this machine can drive this session, without a password",
+                    f"softmode: warning: listening at {options.host}: whoever has that address, which travels "
+                    "unencrypted, can drive this session",
                     file=sys.stderr,
                 )
             if options.open:

@@ -1,6 +1,7 @@
 """Episodes in pytest: a plug-in with fixtures and a marker, and assertions on what was played.
 
-pytest finds the plug-in by itself; ``-p no:softmode`` leaves it out. Names are imported when they are first used.
+pytest finds the plug-in, a module beside this package, by itself; ``-p no:softmode`` leaves it out. Names are imported
+when they are first used.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ from softmode.files import read_archive, write_archive
 from softmode.testing.episode import Episode
 
 _KIND, _VERSION = "softmode-golden-episode", 1
-_REMEDY = "pytest --episodes-golden update"
+_REMEDY = "pytest --softmode-golden update"
 
 
 def write_golden(episode: Episode, path: Path) -> None:

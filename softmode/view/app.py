@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import functools
 import io
 import queue
+import secrets
 import socket
 import sys
 import threading
@@ -14,7 +14,7 @@ import time
 import traceback
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -23,7 +23,7 @@ import numpy as np
 from softmode.checks import require_number
 from softmode.deformables.build.patch import Patch
 from softmode.errors import ConfigError, SoftmodeError, needs_extra
-from softmode.view.live_types import Hit, Vector, finite_vector
+from softmode.view.live_types import Hit, Vector
 from softmode.view.panel import Command, MouseMode, Panel
 from softmode.view.stage import Stage
 
@@ -42,7 +42,7 @@ class ViewOptions:
     """Where a live session is served and how often it is shown."""
 
     host: str = "127.0.0.1"
-    """Address to listen at. Whoever reaches it may drive the session; there is no password."""
+    """Address to listen at. Whoever reaches it, and has the token, may drive the session."""
     port: int = 8080
     """Port to listen at; 0 for any free one."""
     frame_rate: float = 30.0
@@ -51,6 +51,8 @@ class ViewOptions:
     """Where recordings are written."""
     record_as: Literal["mp4", "npz", "usdc"] = "mp4"
     """What a recording is: a video, coordinates to be shown again, or an OpenUSD stage."""
+    token: str = field(default_factory=lambda: secrets.token_urlsafe(16), init=False, repr=False)
+    """Last part of the page's address, drawn anew for each; without it nothing is answered."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -200,23 +202,17 @@ class ViewApp:
 
     async def _on_drag(self, event: Any) -> None:
         """Queue one step of a drag of the mouse; async, so that steps stay in order."""
-        position, wxyz = event.client.camera.position, event.client.camera.wxyz
-        begun, now, client, phase = event.start_position, event.end_position, event.client_id, event.phase
-
-        def drag(session: LiveSession) -> None:
-            given = {"camera": position, "start of the drag": begun, "end of the drag": now}
-            eye, start, end = (finite_vector(name, value) for name, value in given.items())
-            forward = _forward(finite_vector("wxyz", wxyz, 4))
-            self._do_drag(session, client, phase, eye, forward, start, end)
-
-        self.submit(drag)
+        camera, client, phase = event.client.camera, event.client_id, event.phase
+        eye, forward = camera.position, _forward(camera.wxyz)
+        start, end = np.array(event.start_position), np.array(event.end_position)
+        self.submit(lambda session: self._do_drag(session, client, phase, eye, forward, start, end))
 
     async def _on_click(self, event: Any) -> None:
         """Queue a click on the object."""
         origin, along = event.ray_origin, event.ray_direction
 
         def pin(session: LiveSession) -> None:
-            hit = session.pick(finite_vector("ray", origin), finite_vector("ray", along))
+            hit = session.pick(np.array(origin), np.array(along))
             if hit is not None and self._panel.mouse_mode == "pin":
                 session.pin(hit)
 
@@ -330,7 +326,7 @@ def _forward(wxyz: Vector) -> Vector:
 def page_url(options: ViewOptions, port: int) -> str:
     """Return where to point the browser."""
     host = "localhost" if options.host in ("0.0.0.0", "::") else options.host
-    return f"http://{f'[{host}]' if ':' in host else host}:{port}"
+    return f"http://{f'[{host}]' if ':' in host else host}:{port}/{options.token}/"
 
 
 def _viser() -> Any:
@@ -341,25 +337,21 @@ def _viser() -> Any:
 
 
 def start_server(options: ViewOptions) -> viser.ViserServer:
-    """Start viser's server where it was told to be, and nowhere else."""
+    """Start viser's server where it was told to be, and nowhere else, behind a :class:`Gate`."""
     viser = _viser()
     import websockets.asyncio.server as transport  # viser's own
 
+    from softmode.view.gate import Gate
+
     port = _free_port(options.host, options.port)
-    serve = transport.serve
-    if options.is_local:
-        # A web page of anyone's, open in the same browser, reaches this machine's ports too; browsers say where a page
-        # comes from, and viser has no argument for it. None is a client that is no browser.
-        origins = [None, *(f"http://{name}:{port}" for name in ("127.0.0.1", "localhost", "[::1]"))]
-        serve = functools.partial(serve, origins=origins)
-    with _quiet(), _replaced(transport, "serve", serve):
+    gate = Gate(options.token, LOOPBACK if options.is_local else None)
+    with _quiet(), _replaced(transport, "serve", gate.before(transport.serve)):  # viser has no argument for it
         server = viser.ViserServer(host=options.host, port=port, label="softmode", verbose=False)
     if server.get_port() != port:  # viser takes the next port when one is taken
         with _quiet():
             server.stop()
         raise _port_error(options.host, port)
-    # Any browser may ask viser for a tunnel to a public server, button or not.
-    server.request_share_url = lambda verbose=True: None  # type: ignore[method-assign]
+    gate.server = server
     return server
 
 

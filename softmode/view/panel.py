@@ -53,13 +53,10 @@ class Slider:
         """Give the session what the slider shows."""
         session.set_parameters(**{self.parameter: self.write(value)})
 
-    def inside(self, value: float) -> float:
-        """Return the value in the slider's range that is nearest."""
-        return min(max(value, self.limits[0]), self.limits[1])
-
     def shown(self, now: LiveParameters) -> float:
         """Return the value to show, in the slider's range and without the noise of single precision."""
-        return round(self.inside(self.read(getattr(now, self.parameter))), 5)
+        low, high, _ = self.limits
+        return round(min(max(self.read(getattr(now, self.parameter)), low), high), 5)
 
 
 SLIDERS = (
@@ -156,7 +153,7 @@ class Panel:
 
         @mode.on_update
         async def _(_: Any) -> None:
-            chosen: MouseMode = modes.get(mode.value, "drag")
+            chosen = modes[mode.value]
             self._submit(lambda session: self._set_mode(chosen))
 
         unpin = gui.add_button_group("unpin", ("last", "all"))
@@ -193,8 +190,7 @@ class Panel:
     @property
     def brush(self) -> tuple[float, float, float]:
         """Factor, radius and depth of the brush, lengths over the object's size."""
-        inside = [min(max(float(bar.value), 0.01), 0.5) for bar in (self._radius, self._depth)]  # a page may send more
-        return 10.0 ** min(max(float(self._factor.value), -3.0), 3.0), inside[0], inside[1]
+        return 10.0**self._factor.value, self._radius.value, self._depth.value
 
     def _set_mode(self, mode: MouseMode) -> None:
         """Change what the mouse does."""
@@ -241,7 +237,7 @@ class Panel:
         async def changed(event: Any) -> None:
             if event.client is None:  # not a person: the slider follows the session
                 return
-            value = slider.inside(float(handle.value))  # a page may send anything
+            value = handle.value
             self._touched[slider] = time.monotonic()
             self._submit(lambda session: slider.set(session, value))
 

@@ -11,7 +11,7 @@ from typing import Any, get_args
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from softmode.errors import ConfigError, SoftmodeError
+from softmode.errors import SoftmodeError
 from softmode.splats.formats import read_splats
 from softmode.splats.splats import UpAxis, up_rotation
 from softmode.view.app import ViewOptions, aim
@@ -153,13 +153,7 @@ class PreparePage(Page):
         self._show()
 
     def move(self, corner: int, position: np.ndarray) -> None:
-        """Put the lowest (0) or highest (1) corner of the box somewhere; it stays beyond the other one.
-
-        Raises:
-            ConfigError: If the position is not finite.
-        """
-        if not np.isfinite(position).all():
-            raise ConfigError("the corner of the box is not finite")
+        """Put the lowest (0) or highest (1) corner of the box somewhere; it stays beyond the other one."""
         with self._lock:
             self._untouched = False
             least = 0.01 * self._size

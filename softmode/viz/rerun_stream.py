@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import socket
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
@@ -140,6 +141,8 @@ def _reach(stream: rr.RecordingStream, target: str) -> None:
     try:
         if target == "spawn":
             stream.spawn()
+            listens = f"the viewer that rerun opens listens at all addresses, port {PORT}"
+            print(f"softmode: {listens}; one of your own can be kept to this machine by --bind", file=sys.stderr)
             return
         place = urlsplit(target)
         if place.hostname:  # rerun itself would try for as long as there is something to send

@@ -7,8 +7,8 @@ from collections.abc import Callable
 import gymnasium as gym
 import pytest
 
+from pytest_softmode import Episodes
 from softmode.envs.tasks.lift_soft.task import LiftSoftEnv
-from softmode.testing.plugin import Episodes
 
 __all__ = ["Episodes", "MakeEnv"]
 

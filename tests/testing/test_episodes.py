@@ -93,7 +93,7 @@ def test_an_episode_replays_and_another_does_not(press: Episode) -> None:
 def test_golden_episodes(press: Episode, tmp_path: Path) -> None:
     """The same episode passes; another seed, a change, and a missing file are told apart, with the remedy."""
     path = tmp_path / "golden" / "press.npz"
-    with pytest.raises(AssertionError, match=r"there is no golden episode .*--episodes-golden update"):
+    with pytest.raises(AssertionError, match=r"there is no golden episode .*--softmode-golden update"):
         assert_golden(press, path)
     write_golden(press, path)
     assert_golden(press, path)

@@ -27,22 +27,55 @@ def installed(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> pyt
     return pytester
 
 
-HEAVY = """
+OTHERS = """
 import sys
+import pytest
 
-def test_light():
-    heavy = {"warp", "newton", "mujoco", "torch", "scipy", "rerun", "imageio"} & set(sys.modules)
-    assert not heavy, heavy
+@pytest.fixture
+def episode():
+    return "theirs"
+
+@pytest.fixture
+def golden(episode):
+    return episode
+
+@pytest.mark.episodes(3)
+def test_episodes(episode, golden, record_property):
+    assert episode == golden == "theirs"
+    record_property("episodes", "theirs")
+
+def test_light(pytestconfig):
+    assert not {"softmode", "gymnasium", "numpy"} & set(sys.modules)
+    assert pytestconfig.getoption("--episodes-dir") == "theirs"
+"""
+ONCE = """
+def test_once(episode):
+    pass
+
+def test_now(softmode_episode):
+    assert softmode_episode.seed == 0
+"""
+CONFTEST = """
+def pytest_addoption(parser):
+    parser.addoption("--episodes-dir", default="theirs")
 """
 
 
-def test_it_loads_nothing_heavy_and_can_be_left_out(installed: pytest.Pytester) -> None:
-    """A test without its fixtures has loaded no simulator; without the plug-in there are no fixtures."""
-    installed.makepyfile(test_light=HEAVY, test_fixture="def test_fixture(episode):\n    assert episode.seed == 0\n")
-    installed.runpytest_subprocess().assert_outcomes(passed=2)
-    result = installed.runpytest_subprocess("-p", "no:softmode")
-    result.assert_outcomes(passed=1, errors=1)
-    result.stdout.fnmatch_lines(["*fixture 'episode' not found*"])
+def test_other_projects_do_not_notice_it(installed: pytest.Pytester) -> None:
+    """Its import brings nothing; markers, fixtures and options of the short names are theirs, or missing with a hint.
+
+    A project that used the short names once is told the new ones; without the plug-in it has neither.
+    """
+    installed.makeini("[pytest]\nmarkers = episodes: theirs")
+    installed.makeconftest(CONFTEST)
+    installed.makepyfile(test_others=OTHERS, test_once=ONCE)
+    result = installed.runpytest_subprocess("-W", "error", "--strict-markers", "--strict-config")
+    result.assert_outcomes(passed=3, errors=1)
+    result.stdout.fnmatch_lines(
+        ["*fixture 'episode' not found*", "*called softmode_episode*softmode_short_names = true*"]
+    )
+    result.stdout.no_fnmatch_line("*softmode: episodes*")
+    installed.runpytest_subprocess("-p", "no:softmode").assert_outcomes(passed=2, errors=2)
 
 
 MARKED = """
@@ -51,9 +84,9 @@ import pytest
 def coin(episode, bad):
     assert episode.seed not in bad, "tails"
 
-@pytest.mark.episodes(20, min_success=0.9)
-def test_enough(episode):
-    coin(episode, range(4))
+@pytest.mark.softmode_episodes(20, min_success=0.9)
+def test_enough(softmode_episode):
+    coin(softmode_episode, range(4))
 
 @pytest.mark.episodes(20, min_success=0.9)
 def test_too_few(episode):
@@ -66,6 +99,9 @@ def test_proven(episode):
 @pytest.mark.episodes(40, min_success=0.9, proven=True)
 def test_not_proven(episode):
     coin(episode, [7])
+
+def test_short(soft_env, golden):
+    pass
 
 @pytest.mark.episodes(3)
 def test_all(episode):
@@ -86,10 +122,14 @@ def test_an_error_is_no_lost_episode(episode):
 
 
 def test_the_marker_judges_by_wilsons_interval(installed: pytest.Pytester) -> None:
-    """16 of 20 (58 to 92 %) leave 90 % open, 15 (53 to 89 %) do not; 40 of 40 (91 to 100 %) prove it, 39 do not."""
+    """16 of 20 (58 to 92 %) leave 90 % open, 15 (53 to 89 %) do not; 40 of 40 (91 to 100 %) prove it, 39 do not.
+
+    One line of the settings makes the short names the same.
+    """
+    installed.makeini("[pytest]\nsoftmode_short_names = true")
     installed.makepyfile(MARKED)
-    result = installed.runpytest_subprocess("--strict-markers")
-    result.assert_outcomes(passed=2, failed=6)
+    result = installed.runpytest_subprocess("--strict-markers", "-W", "error")
+    result.assert_outcomes(passed=3, failed=6)
     result.stdout.fnmatch_lines(
         [
             "15 of 20 episodes succeeded (95 %: 53.1% to 88.8%, wanted 90.0%)",
@@ -97,9 +137,9 @@ def test_the_marker_judges_by_wilsons_interval(installed: pytest.Pytester) -> No
             "39 of 40 episodes succeeded (95 %: 87.1% to 99.6%, wanted 90.0% proven)",
             "2 of 3 episodes succeeded (95 %: 20.8% to 93.9%, wanted 100.0%)",
             "*20 of 20 successes prove 83.9%, not 90.0%. Give a larger count or a lower min_success*",
-            "*marked with episodes and has no argument `episode`*",
+            "*marked with episodes and uses no softmode_episode*",
             "*RuntimeError: broken*",
-            "*= episodes =*",
+            "*= softmode: episodes =*",
             "*::test_enough: 16 of 20 episodes succeeded (95 %: 58.4% to 91.9%, wanted 90.0%)",
         ],
         consecutive=False,
@@ -113,21 +153,22 @@ from softmode.testing import assert_max_penetration
 def env_of(soft_env):
     return soft_env("softmode/PressSoft-v0", max_episode_steps=12, render_size=64)
 
-def test_depth(soft_env, episode):
-    assert_max_penetration(episode(env_of(soft_env), "scripted", 1), 0.001)
+def test_depth(softmode_env, softmode_episode):
+    assert_max_penetration(softmode_episode(env_of(softmode_env), "scripted", 1), 0.001)
 
-def test_policy(soft_env, episode):
+def test_policy(softmode_env, softmode_episode):
     def policy(observation):
         if observation[0] and len(seen) == 5:
             raise RuntimeError("the policy is broken")
         seen.append(observation)
         return np.zeros(5, np.float32)
     seen = []
-    episode(env_of(soft_env), policy)
+    softmode_episode(env_of(softmode_env), policy)
 """
 GOLDEN = """
-def test_golden(soft_env, episode, golden):
-    golden(episode(soft_env("softmode/PressSoft-v0", max_episode_steps=12, render_size=64), "scripted"))
+def test_golden(softmode_env, softmode_episode, softmode_golden):
+    env = softmode_env("softmode/PressSoft-v0", max_episode_steps=12, render_size=64)
+    softmode_golden(softmode_episode(env, "scripted"))
 """
 
 
@@ -143,7 +184,7 @@ def test_the_page_runs_and_failures_lie_beside_the_report(
     monkeypatch.setenv("SOFTMODE_CACHE", str(cache))
     page = ROOT / "docs" / "testing_policies.md"
     installed.makepyfile(test_page="\n".join(fence.text for fence in fences(page, "python")), test_played=PLAYED)
-    result = installed.runpytest_subprocess("--junitxml=out/report.xml", "-n", "2", "--episodes-golden", "update")
+    result = installed.runpytest_subprocess("--junitxml=out/report.xml", "-n", "2", "--softmode-golden", "update")
     result.assert_outcomes(passed=3, failed=2)
     kept = installed.path / "out" / "report-episodes"
     for name in ("test_played.py_test_depth-seed1", "test_played.py_test_policy-seed0"):
@@ -156,4 +197,4 @@ def test_the_page_runs_and_failures_lie_beside_the_report(
     installed.makepyfile(test_golden=GOLDEN)
     result = installed.runpytest_subprocess("-k", "changed or golden")
     result.assert_outcomes(passed=1, failed=1)
-    result.stdout.fnmatch_lines(["*there is no golden episode*--episodes-golden update*"])
+    result.stdout.fnmatch_lines(["*there is no golden episode*--softmode-golden update*"])

@@ -1,6 +1,6 @@
 """A page without a browser: connects to a view's websocket as viser's page does, and counts what arrives.
 
-Run: ``python -m tests.view.page_client http://127.0.0.1:8080 SECONDS``; prints one line of JSON.
+Run: ``python -m tests.view.page_client http://127.0.0.1:8080/TOKEN/ SECONDS``; prints one line of JSON.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class PageClient:
     """One connection; a context manager.
 
     Args:
-        url: The page's address, http://host:port.
+        url: The page's address, http://host:port/token/.
         origin: The page that a browser would say it comes from; None for a client that is no browser.
     """
 

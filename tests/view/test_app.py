@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -251,7 +252,7 @@ def test_what_cannot_be_done_is_told_and_survived(view: Served, capfd: pytest.Ca
 
 
 def test_a_damaged_drag_ends_nothing(view: Served, capfd: pytest.CaptureFixture[str]) -> None:
-    """A message with a vector too short, or not finite, is told; whatever a command raises, the session goes on."""
+    """A vector too short, or not finite, does not reach the session; whatever a command raises, the session goes on."""
     size = view.ask(lambda session: session.size)
     with PageClient(view.app.url) as client:
         client.send(camera_message(np.array([0.0, -6.0 * size, 0.1])))
@@ -261,37 +262,27 @@ def test_a_damaged_drag_ends_nothing(view: Served, capfd: pytest.CaptureFixture[
         assert view.wait(lambda session: "ZeroDivisionError" in view.app._panel._message.content)
         assert view.ask(lambda session: session.drag()) is None
     told = capfd.readouterr().err
-    assert told.count("must be three finite numbers") == 2 and "ZeroDivisionError" in told
+    assert told.count("no page of softmode's sends") == 1 and "ZeroDivisionError" in told
 
 
 def test_pages_of_others_are_refused(view: Served) -> None:
     """A web page of another origin, open in the same browser, gets no connection; the tool's own page does."""
     from websockets.exceptions import InvalidStatus
 
-    port = view.app.url.rpartition(":")[2]
+    port = urlsplit(view.app.url).port
     for origin in ("https://example.com", "http://127.0.0.1:1", "null"):
         with pytest.raises(InvalidStatus) as caught:
             PageClient(view.app.url, origin=origin)
         assert caught.value.response.status_code == 403
-    with PageClient(view.app.url, origin=f"http://localhost:{port}") as client:
+    with PageClient(view.app.url, origin=f"http://127.0.0.1:{port}") as client:
         assert len(client.receive(5.0)[0])
-
-
-def test_nobody_can_ask_for_a_public_address(view: Served) -> None:
-    """Viser's message that opens a tunnel to a public server does nothing."""
-    with PageClient(view.app.url) as client:
-        client.send({"type": "ShareUrlRequest"})
-        for _ in range(10):
-            kinds = [message["type"] for message in client.receive(5.0)[0]]
-            assert not [kind for kind in kinds if "ShareUrl" in kind]
-    assert view.app._server._share_tunnel is None
 
 
 def test_only_this_machine_by_default(view: Served) -> None:
     """The socket is bound to 127.0.0.1."""
     assert ViewOptions().host == "127.0.0.1"
     assert view.app.url.startswith("http://127.0.0.1:")
-    port = int(view.app.url.rpartition(":")[2])
+    port = urlsplit(view.app.url).port
     with socket.socket() as other:  # another address of this machine is not taken
         other.bind(("127.0.0.2", port))
 
@@ -321,7 +312,7 @@ def test_the_remedy_fits_the_address() -> None:
 
 def test_a_port_that_is_taken_is_an_error(view: Served, capsys: pytest.CaptureFixture[str]) -> None:
     """Not the next free one, as viser would have it: the error names port and remedy, before anything is built."""
-    port = view.app.url.rpartition(":")[2]
+    port = str(urlsplit(view.app.url).port)
     assert main(["view", "--port", port, "--no-open", "--duration", "1"]) == 2
     said = capsys.readouterr().err
     assert f"port {port}" in said and "--port" in said
@@ -341,7 +332,7 @@ def test_the_command_serves_for_a_while(saved: str, capfd: pytest.CaptureFixture
     said = capfd.readouterr()
     assert "http://127.0.0.1:" in said.out and "warning" not in said.err and "viser" not in said.out
     assert main([*arguments, "--host", "0.0.0.0", "--scene", "drop"]) == 0
-    assert "anyone who reaches port" in capfd.readouterr().err
+    assert "whoever has that address" in capfd.readouterr().err
 
 
 def test_a_recording_is_kept_when_the_command_ends(

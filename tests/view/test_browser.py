@@ -51,7 +51,7 @@ def page(view: Served) -> Iterator[Any]:
         browser = driver.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
         try:
             page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
-            page.goto(f"{view.app.url}/?fixedDpr=0.5")
+            page.goto(f"{view.app.url}?fixedDpr=0.5")
             page.locator(".mantine-Notification-closeButton").first.click(timeout=30_000)  # "software rendering"
             assert until(lambda: orange(page).sum() > 300), "no object in the picture"
             yield page

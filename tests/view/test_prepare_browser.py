@@ -99,10 +99,10 @@ def test_gizmos_in_a_browser_prepare_what_is_shown(tmp_path: Path) -> None:
     ):
         try:
             assert running.stdout is not None
-            assert "open http" in running.stdout.readline()
+            url = next(word for word in running.stdout.readline().split() if word.startswith("http"))
             browser = driver.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
             page = browser.new_page(viewport={"width": SIZE[0], "height": SIZE[1]})
-            page.goto(f"http://127.0.0.1:{port}/?fixedDpr=1")
+            page.goto(f"{url}?fixedDpr=1")
             page.locator(".mantine-Notification-closeButton").first.click(timeout=30_000)
             page.get_by_role("button", name="prepare").click(timeout=30_000)
             repeat, hand = page.locator("textarea").first, Hand(page, twin)
@@ -123,7 +123,7 @@ def test_gizmos_in_a_browser_prepare_what_is_shown(tmp_path: Path) -> None:
             told = repeat.input_value()
             page.get_by_role("button", name="build").click()
             page.get_by_role("button", name="prepare").wait_for(timeout=PATIENCE)
-            with PageClient(f"http://127.0.0.1:{port}") as client:
+            with PageClient(url) as client:
                 shown = client.splats()[0][:, :3].copy().view(np.float32)
             browser.close()
         finally:

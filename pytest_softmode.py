@@ -1,12 +1,15 @@
-"""The pytest plug-in: fixtures `soft_env`, `episode` and `golden`, and the marker `episodes`.
+"""The pytest plug-in: fixtures `softmode_env`, `softmode_episode`, `softmode_golden`, the marker `softmode_episodes`.
 
-It loads nothing heavy until a fixture is used; ``-p no:softmode`` leaves it out.
+``softmode_short_names = true`` among pytest's settings calls them `soft_env`, `episode`, `golden` and `episodes` too.
+pytest loads the plug-in in every project of an environment. So it lies beside the package, whose import brings
+Gymnasium, and imports nothing of it until a fixture is used; ``-p no:softmode`` leaves it out.
 """
 
 from __future__ import annotations
 
 import inspect
 import re
+import types
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,10 +23,14 @@ if TYPE_CHECKING:
 
 _PLAYED = pytest.StashKey[list["Episode"]]()
 """Episodes that a test has played, the last one last."""
-_RATE = "episodes"
+_RATE = "softmode_episodes"
 """Property of a report: how many episodes succeeded."""
+_SHORT = "softmode_short_names"
+"""The setting that brings the short names."""
+_NAMES = {"soft_env": "softmode_env", "episode": "softmode_episode", "golden": "softmode_golden"}
+"""Short names of fixtures, and what they stand for."""
 _MARKER = (
-    "episodes(count, min_success=1.0, first_seed=0, proven=False): play the test for so many seeds; it fails if the "
+    "(count, min_success=1.0, first_seed=0, proven=False): play the test for so many seeds; it fails if the "
     "95 % interval of its success rate (Wilson) lies below min_success, or if proven unless it lies above"
 )
 
@@ -32,32 +39,36 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     """Add the options."""
     group = parser.getgroup("softmode", "episodes of softmode")
     group.addoption(
-        "--episodes-dir",
+        "--softmode-episodes-dir",
         type=Path,
         help="folder for films, recordings and states of failed episodes (default: beside the file of --junitxml, or "
         "failed-episodes)",
     )
     group.addoption(
-        "--episodes-golden",
+        "--softmode-golden",
         choices=("check", "update"),
         default="check",
         help="compare golden episodes, or write them anew",
     )
+    parser.addini(_SHORT, "call fixtures and marker soft_env, episode, golden and episodes too", "bool", default=False)
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Register the marker."""
-    config.addinivalue_line("markers", _MARKER)
+    """Register the marker, and the short names where they are wanted."""
+    config.addinivalue_line("markers", f"softmode_episodes{_MARKER}")
+    if config.getini(_SHORT):
+        config.addinivalue_line("markers", f"episodes{_MARKER}")
+        config.pluginmanager.register(_short_names(), _SHORT)
 
 
 # -- fixtures ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="session")
-def soft_env() -> Iterator[Callable[..., gym.Env]]:
+def softmode_env() -> Iterator[Callable[..., gym.Env]]:
     """Return a function from an id, and options or fields of the configuration, to an environment.
 
-    ``soft_env("softmode/PushSoft-v0", obs_type="pixels", goal_tolerance=0.01)``. Equal arguments give the same
+    ``softmode_env("softmode/PushSoft-v0", obs_type="pixels", goal_tolerance=0.01)``. Equal arguments give the same
     environment throughout the session, which an episode resets; ``copy.deepcopy`` gives one of its own.
     """
     made: dict[str, gym.Env] = {}
@@ -75,7 +86,7 @@ def soft_env() -> Iterator[Callable[..., gym.Env]]:
 
 
 class Episodes:
-    """The fixture `episode`: plays episodes and remembers them for the report.
+    """The fixture `softmode_episode`: plays episodes and remembers them for the report.
 
     Args:
         played: Where they are remembered.
@@ -84,7 +95,7 @@ class Episodes:
     def __init__(self, played: list[Episode]) -> None:
         """Start with seed 0."""
         self.seed = 0
-        """Seed of the next episode that names none; the marker `episodes` counts it up."""
+        """Seed of the next episode that names none; the marker counts it up."""
         self._played = played
 
     def __call__(
@@ -97,18 +108,18 @@ class Episodes:
 
 
 @pytest.fixture
-def episode(request: pytest.FixtureRequest) -> Episodes:
-    """Return a function that plays an episode: ``episode(env, policy, seed)``."""
+def softmode_episode(request: pytest.FixtureRequest) -> Episodes:
+    """Return a function that plays an episode: ``softmode_episode(env, policy, seed)``."""
     return Episodes(request.node.stash.setdefault(_PLAYED, []))
 
 
 @pytest.fixture
-def golden(request: pytest.FixtureRequest) -> Callable[..., None]:
-    """Return a function that compares an episode with the golden one: ``golden(episode, name, atol=0.0)``.
+def softmode_golden(request: pytest.FixtureRequest) -> Callable[..., None]:
+    """Return a function that compares an episode with the golden one: ``softmode_golden(episode, name, atol=0.0)``.
 
     It lies in the folder ``golden`` beside the test, and is named after the test, and `name` if it has several.
     """
-    update = request.config.getoption("--episodes-golden") == "update"
+    update = request.config.getoption("--softmode-golden") == "update"
 
     def check(episode: Episode, name: str = "", *, atol: float = 0.0) -> None:
         """Compare an episode, or write it as the golden one."""
@@ -122,6 +133,26 @@ def golden(request: pytest.FixtureRequest) -> Callable[..., None]:
             assert_golden(episode, path, atol=atol)
 
     return check
+
+
+def _short_names() -> types.ModuleType:
+    """Return a plug-in that has the fixtures by their short names."""
+
+    @pytest.fixture(scope="session")
+    def soft_env(softmode_env: Callable[..., gym.Env]) -> Callable[..., gym.Env]:
+        return softmode_env
+
+    @pytest.fixture
+    def episode(softmode_episode: Episodes) -> Episodes:
+        return softmode_episode
+
+    @pytest.fixture
+    def golden(softmode_golden: Callable[..., None]) -> Callable[..., None]:
+        return softmode_golden
+
+    plugin = types.ModuleType(_SHORT)
+    vars(plugin).update(soft_env=soft_env, episode=episode, golden=golden)
+    return plugin
 
 
 def _made(env: str, given: dict[str, Any]) -> gym.Env:
@@ -150,13 +181,15 @@ def _made(env: str, given: dict[str, Any]) -> gym.Env:
 @pytest.hookimpl(tryfirst=True)
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
     """Call a marked test once for every seed, and judge how many passed."""
-    marker = pyfuncitem.get_closest_marker("episodes")
+    marker = pyfuncitem.get_closest_marker("softmode_episodes")
+    if marker is None and pyfuncitem.config.getini(_SHORT):
+        marker = pyfuncitem.get_closest_marker("episodes")
     if marker is None:
         return None
     seeds, judge = _rule(*marker.args, **marker.kwargs)
-    player = pyfuncitem.funcargs.get("episode")
+    player = pyfuncitem.funcargs.get("softmode_episode")
     if not isinstance(player, Episodes):
-        raise pytest.UsageError(f"{pyfuncitem.nodeid} is marked with episodes and has no argument `episode`")
+        raise pytest.UsageError(f"{pyfuncitem.nodeid} is marked with {marker.name} and uses no softmode_episode")
     arguments = {name: pyfuncitem.funcargs[name] for name in inspect.signature(pyfuncitem.obj).parameters}
     played = pyfuncitem.stash[_PLAYED]
     failures, shown = {}, []
@@ -214,7 +247,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
         if name == _RATE
     }
     if rates:
-        terminalreporter.section("episodes")
+        terminalreporter.section("softmode: episodes")
     for nodeid, rate in rates.items():
         terminalreporter.line(f"{nodeid}: {rate}")
 
@@ -226,8 +259,15 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 def pytest_runtest_makereport(
     item: pytest.Item, call: pytest.CallInfo[None]
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """Play the episode of a failure again, and put film, recording and state beside the report."""
+    """Play the episode of a failure again, and put film, recording and state beside the report.
+
+    Where a fixture is missing whose name was softmode's once, say what it is called now.
+    """
     report = yield
+    if call.excinfo is not None and isinstance(missing := call.excinfo.value, pytest.FixtureLookupError):
+        if missing.argname in _NAMES:
+            hint = f"softmode's is called {_NAMES[missing.argname]}; the line `{_SHORT} = true` among pytest's settings"
+            report.sections.append(("softmode", f"{hint} brings the short names"))
     played = item.stash.get(_PLAYED, [])
     if call.when == "call" and report.failed and played:
         from softmode.errors import SoftmodeError
@@ -245,7 +285,7 @@ def pytest_runtest_makereport(
 
 def _folder(config: pytest.Config) -> Path:
     """Return where failed episodes go."""
-    chosen, report = config.getoption("--episodes-dir"), config.getoption("xmlpath", None)
+    chosen, report = config.getoption("--softmode-episodes-dir"), config.getoption("xmlpath", None)
     if chosen is not None:
         return config.invocation_params.dir / chosen
     if report:
