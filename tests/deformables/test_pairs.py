@@ -462,10 +462,13 @@ def stack(count=3, **kw):
 
 
 def test_stack_carries_its_weight():
-    """Three soft cubes at rest: the net force on each is its weight to 1e-4, whichever it stands on."""
+    """Three soft cubes at rest: the net force on each is its weight to 1e-4, whichever it stands on.
+
+    After 300 steps what still sways was 0.55 of the tolerance with one processor and 0.79 with another; after 500, 0.15.
+    """
     scene = stack()
     replay = scene.capture()
-    for _ in range(300):  # on their dents they sway for longer than their material damps
+    for _ in range(500):  # on their dents they sway for longer than their material damps
         replay()
     force, weight = scene.reduced.instance_force.numpy(), scene.mass() * GRAVITY
     np.testing.assert_allclose(force[:, 2], weight, rtol=1e-4)
