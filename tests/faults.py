@@ -11,7 +11,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -105,12 +105,32 @@ def signalled(number: signal.Signals, when: Callable[[], object]) -> Iterator[No
         signal.signal(signal.SIGINT, before)
 
 
-def start(code: str, *arguments: object, disk: int | None = None) -> subprocess.Popen[str]:
-    """Start Python with code that sees the package and the tests; `disk` is the largest size of its files [bytes]."""
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+def start(
+    code: str,
+    *arguments: object,
+    disk: int | None = None,
+    environment: Mapping[str, str] | None = None,
+    session: bool = False,
+) -> subprocess.Popen[str]:
+    """Start Python with code that sees the package and the tests.
+
+    Args:
+        code: The code.
+        arguments: Its arguments.
+        disk: Largest size of its files [bytes].
+        environment: Further variables of its environment.
+        session: Give it a session of its own, whose number is its own.
+    """
+    variables = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", **(environment or {})}
     text = code if disk is None else FULL_DISK.format(size=disk) + code
-    command = [sys.executable, "-c", text, *map(str, arguments)]
-    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    return subprocess.Popen(
+        [sys.executable, "-c", text, *map(str, arguments)],
+        env=variables,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=session,
+    )
 
 
 def run(code: str, *arguments: object, disk: int | None = None) -> tuple[int, str]:
@@ -120,11 +140,13 @@ def run(code: str, *arguments: object, disk: int | None = None) -> tuple[int, st
     return process.returncode, written
 
 
-def end_at(process: subprocess.Popen[str], line: Callable[[str], bool], number: signal.Signals) -> tuple[int, str]:
-    """Send a process a signal when it writes such a line; return its exit code and what it wrote after."""
+def end_at(
+    process: subprocess.Popen[str], line: Callable[[str], bool], number: signal.Signals, *, read: bool = True
+) -> tuple[int, str]:
+    """Send a process a signal, when it writes such a line or at once; return its exit code and what it wrote after."""
     assert process.stdout is not None
     try:
-        for written in process.stdout:
+        for written in process.stdout if read else ():
             if line(written):
                 break
         process.send_signal(number)
