@@ -89,6 +89,16 @@ def test_a_seeded_reset_leaves_nothing_of_before(lift: LiftSoftEnv) -> None:
     assert not {"state.softmode.dt_before", "hessian.cached"} & set(different) and first.random == second.random
 
 
+def test_materials_in_which_sound_is_too_fast_are_refused(lift: LiftSoftEnv) -> None:
+    """c = sqrt(E (1 - nu) / ((1 + nu) (1 - 2 nu) rho)) is at most 3 km/s: beyond it steps have diverged."""
+    light = {"density": 100.0, "poissons_ratio": 0.45}
+    modulus = 9.0e6 * 100.0 * 1.45 * 0.1 / 0.55
+    assert lift.reset(options={**light, "youngs_modulus": 0.99 * modulus})[1]["parameters"]["density"] == 100.0
+    for refused in ({**light, "youngs_modulus": 1.01 * modulus}, {"youngs_modulus": 1.0e11}):
+        with pytest.raises(ConfigError, match="sound"):
+            lift.reset(options=refused)
+
+
 def test_reset_draws_within_its_ranges(lift: LiftSoftEnv) -> None:
     """Position and Young's modulus stay inside the configured ranges and use them."""
     config = lift.config
