@@ -16,12 +16,12 @@ from tests import faults
 from tests.needs import needs
 
 HELD = """
-import hashlib, sys, time
+import hashlib, sys, threading, time
 from softmode import interrupts
 interrupts.GRACE = float(sys.argv[2])
 with interrupts.ending_on_sigterm() as ended:
     try:
-        print("ready", flush=True)
+        threading.Timer(0.3, print, ("ready",), {"flush": True}).start()
         if sys.argv[1] == "compiled":  # one call that Python cannot end
             hashlib.pbkdf2_hmac("sha256", b"", b"", 2_000_000_000)
         time.sleep(60.0)

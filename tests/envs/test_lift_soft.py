@@ -90,9 +90,9 @@ def test_a_seeded_reset_leaves_nothing_of_before(lift: LiftSoftEnv) -> None:
 
 
 def test_materials_in_which_sound_is_too_fast_are_refused(lift: LiftSoftEnv) -> None:
-    """The speed sqrt(E (1 - nu) / ((1 + nu) (1 - 2 nu) rho)) is at most 3 km/s: beyond steps have diverged."""
+    """The speed sqrt(E (1 - nu) / ((1 + nu) (1 - 2 nu) rho)) is at most 1 km/s: beyond steps have diverged."""
     light = {"density": 100.0, "poissons_ratio": 0.45}
-    modulus = 9.0e6 * 100.0 * 1.45 * 0.1 / 0.55
+    modulus = 1.0e6 * 100.0 * 1.45 * 0.1 / 0.55
     assert lift.reset(options={**light, "youngs_modulus": 0.99 * modulus})[1]["parameters"]["density"] == 100.0
     for refused in ({**light, "youngs_modulus": 1.01 * modulus}, {"youngs_modulus": 1.0e11}):
         with pytest.raises(ConfigError, match="sound"):
