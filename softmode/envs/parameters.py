@@ -134,7 +134,7 @@ def check_options(
 
 _ELASTIC = {"youngs_modulus", "poissons_ratio", "density"}
 _SPEED = 1.0e3
-"""Fastest compression wave of a material that a reset option may ask for [m/s]; at three times that one step in a thousand diverged."""
+"""Fastest compression wave of a material that a reset option may ask for [m/s]; at three times that steps diverged."""
 
 
 def _check_speed(values: Mapping[str, NDArray[np.floating]]) -> None:
