@@ -69,6 +69,34 @@ def needs_extra(extra: str, message: str, *, otherwise: str = "") -> Iterator[No
         raise MissingExtraError(message, hint=f"install it with: pip install 'softmode[{extra}]'{otherwise}") from error
 
 
+class MemoryShortError(SoftmodeError, MemoryError):
+    """More memory is asked for than there is."""
+
+
+@contextlib.contextmanager
+def memory_errors(what: str, *, size: int | None = None, hint: str = "ask for less") -> Iterator[None]:
+    """Turn a MemoryError in a block into one that says what was asked for.
+
+    Args:
+        what: What needs the memory.
+        size: How much [bytes], if the error does not tell, as NumPy's do.
+        hint: The remedy.
+
+    Raises:
+        MemoryShortError: If the block raises MemoryError.
+    """
+    try:
+        yield
+    except Exception as caught:
+        error: BaseException | None = caught
+        while not (error is None or isinstance(error, MemoryError)):  # what failed after it may hide it
+            error = error.__context__
+        if error is None or isinstance(error, MemoryShortError):
+            raise
+        asked = str(error) or ("its size is not told" if size is None else f"{size / 1e9:.3g} GB were asked for")
+        raise MemoryShortError(f"{what} takes more memory than there is: {asked}", hint=hint) from error
+
+
 class StorageError(SoftmodeError, OSError):
     """A file cannot be written: no space is left, or the place may not be written to."""
 

@@ -7,7 +7,6 @@ import io
 import json
 import math
 import os
-import secrets
 import zipfile
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
@@ -16,7 +15,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.errors import AssetError, SoftmodeError, StorageError
+from softmode.errors import AssetError, SoftmodeError, StorageError, memory_errors
+from softmode.leftovers import Claim
 
 PLACE_HINT = "check the folder, its permissions and the free space"
 """The remedy for a file that cannot be written."""
@@ -57,7 +57,8 @@ class PendingFile:
     """A file that is written under a temporary name beside it, and that appears whole or not at all.
 
     As a context it takes its place when the block ends without an error. Readers see the old content or the new, never
-    a part. It has the permissions that the umask asks for.
+    a part. It has the permissions that the umask asks for. What a process that was killed left in the folder is
+    removed.
 
     Args:
         path: The file to be.
@@ -71,16 +72,15 @@ class PendingFile:
     def __init__(self, path: str | os.PathLike[str], what: str = "file", *, make_folders: bool = True) -> None:
         """Claim the temporary file."""
         self.path = Path(path)
-        self.temporary = self.path.with_name(f".{self.path.stem}-{secrets.token_hex(6)}{self.path.suffix}")
-        """Where to write."""
-        self._made = [folder for folder in self.path.absolute().parents if make_folders and not folder.exists()]
+        self._claim: Claim | None = None
         self._what = f"{what} {self.path}"
         try:
             with storage_errors(self._what):
                 if self.path.is_dir():
                     raise IsADirectoryError("it is a folder")
-                if make_folders:
-                    self.path.parent.mkdir(parents=True, exist_ok=True)
+                self._claim = Claim(self.path, make_folders=make_folders)
+                self.temporary = self._claim.name(self.path.suffix)
+                """Where to write."""
                 self.temporary.open("xb").close()
         except BaseException:
             self.discard()
@@ -91,16 +91,12 @@ class PendingFile:
         with storage_errors(self._what):
             sync(self.temporary)
             os.replace(self.temporary, self.path)
-        self._made = []
+        self.discard()
 
     def discard(self) -> None:
         """Remove what was not published."""
-        with contextlib.suppress(OSError):
-            self.temporary.unlink()
-        for folder in self._made:
-            with contextlib.suppress(OSError):
-                folder.rmdir()
-        self._made = []
+        if self._claim is not None:
+            self._claim.release()
 
     def __enter__(self) -> PendingFile:
         """Return the file."""
@@ -138,6 +134,15 @@ def check_place(path: str | os.PathLike[str], what: str = "file", *, make_folder
         )
     if Path(path).is_dir() or not os.access(folder, os.W_OK):
         raise StorageError(f"{what} {path} cannot be written there", hint="choose another name or folder")
+
+
+def free_name(path: Path) -> Path:
+    """Return the path, or one with a number behind its stem, that is not there and that nobody is writing."""
+    found, k = path, 0
+    while found.exists() or any(found.parent.glob(f".{found.stem}-*.lock")):
+        k += 1
+        found = path.with_stem(f"{path.stem}-{k}")
+    return found
 
 
 @contextlib.contextmanager
@@ -223,8 +228,9 @@ def archive_bytes(header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]])
     """Return the bytes of the file that :func:`write_archive` writes."""
     stored = {**arrays, "header": np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)}
     stream = io.BytesIO()
-    np.savez(stream, allow_pickle=False, **stored)
-    return stream.getvalue()
+    with memory_errors("an archive", size=2 * sum(array.nbytes for array in stored.values())):
+        np.savez(stream, allow_pickle=False, **stored)
+        return stream.getvalue()
 
 
 def read_archive(

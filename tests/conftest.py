@@ -24,6 +24,7 @@ gc.disable()  # until all tests are collected: it takes a quarter of the time, a
 _TESTS = Path(__file__).resolve().parent
 _CACHE = _TESTS.parent / ".cache"
 os.environ.setdefault("WARP_CACHE_PATH", str(_CACHE / "warp"))
+os.environ.setdefault("SB3_LOGDIR", str(_CACHE / "stable_baselines3"))  # it makes a folder in /tmp otherwise
 _BODIES = Path(os.environ.get("SOFTMODE_CACHE", _CACHE / "softmode"))
 if _BODIES.name != (_NAME := f"tests-{sources_hash()}"):  # as a process of this run has set it
     os.environ["SOFTMODE_CACHE"] = str(_BODIES / _NAME)  # a body does not outlive the sources that built it

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import subprocess
 import sys
@@ -17,6 +18,10 @@ from PIL import Image
 
 import softmode
 from softmode.cli.main import main
+from softmode.cli.plain import plain_output
+from softmode.deformables.build.build_body import build_body
+from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.build.quadrature import quadrature_from_capsule
 from softmode.envs.markers import dots
 from softmode.splats import make_plush, write_ply, write_splats
 from softmode.viz.film import Film
@@ -159,6 +164,33 @@ class SlowLiftEnv(SoftEnv):
 
 gym.register("SlowLift-v0", entry_point=SlowLiftEnv, max_episode_steps=3)
 """
+
+
+def test_help_is_written_where_there_is_only_ascii(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a terminal cannot show becomes a question mark."""
+    shown = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(shown, encoding="ascii"))
+    with pytest.raises(SystemExit) as end:
+        main(["--help"])
+    sys.stdout.flush()
+    assert end.value.code == 0 and b"list-envs" in shown.getvalue() and b"?" in shown.getvalue()
+
+
+def test_no_name_from_a_file_steers_the_terminal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Escapes, controls and turned text in a body's name are shown, not obeyed; an error's colours are not lost."""
+    name = "toy\x1b]0;title\x07\x1b[8m\r\x9b2J\u202e"
+    file = tmp_path / "toy.npz"
+    quadrature = quadrature_from_capsule(0.02, 0.02, point_count=600, surface_count=60)
+    build_body(quadrature, BuildOptions(mode_count=4, kernel_count=80, cubature_count=48), name=name).save(file)
+    code = main(["body", "check", str(file)])
+    out = capsys.readouterr().out
+    assert code in (0, 1, 2) and "toy?]0;title??[8m??2J?" in out
+    assert not set(out) & set("\x1b\x07\r\x9b\u202e")
+    with plain_output():
+        print("\x1b[31mbroken\x1b[0m")
+        print("\rbar", end="", file=sys.stderr)
+    told = capsys.readouterr()
+    assert told.out == "\x1b[31mbroken\x1b[0m\n" and told.err == "\rbar"
 
 
 def test_list_envs_names_every_environment(capsys: pytest.CaptureFixture[str]) -> None:

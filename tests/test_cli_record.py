@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,6 +14,7 @@ import pytest
 from softmode import ENVIRONMENTS
 from softmode.cli.main import main
 from softmode.demonstrations import read_dataset
+from tests.faults import signalled
 from tests.marks import rest_but
 from tests.needs import needs
 
@@ -94,22 +93,18 @@ def test_pictures(tmp_path: Path, short: Callable[[int], None], pictures: str):
     assert len(found["observation.images.front"]) == 4
 
 
-def test_append_and_interruption(tmp_path: Path, short: Callable[[int], None], capfd: pytest.CaptureFixture[str]):
+@pytest.mark.parametrize(
+    ("number", "code"), rest_but([(signal.SIGTERM, 143)], [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+)
+def test_append_and_interruption(
+    tmp_path: Path, short: Callable[[int], None], capfd: pytest.CaptureFixture[str], number: signal.Signals, code: int
+):
     """Interrupted, it says what is there and how to go on; going on adds episodes."""
     short(4)
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
-
-    def interrupt() -> None:
-        while not (tmp_path / "d").exists():
-            time.sleep(0.01)
-        os.kill(os.getpid(), signal.SIGINT)
-
     arguments = ("--obs-type", "state", "--policy", "zero")
-    thread = threading.Thread(target=interrupt)
-    thread.start()
-    assert record(tmp_path / "d", *arguments, "--episodes", "10000") == 130
-    thread.join()
-    signal.signal(signal.SIGINT, before)
+    with signalled(number, (tmp_path / "d").exists):
+        assert record(tmp_path / "d", *arguments, "--episodes", "10000") == code
+    assert [path.name for path in tmp_path.iterdir()] == ["d"] and not list((tmp_path / "d").glob(".*"))
     count = read_dataset(tmp_path / "d").episode_count
     assert 1 <= count < 10_000
     _, err = capfd.readouterr()

@@ -12,6 +12,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 FLOORS = (
     "softmode errors",
+    "leftovers interrupts",
     "files checks lazy pause quiet versions",
     "deformables foreign",
     "splats robots mpm",

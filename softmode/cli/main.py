@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import operator
 import sys
@@ -15,6 +16,7 @@ from softmode.cli.listing import ListEnvs
 from softmode.cli.morph import Morph
 from softmode.cli.new import New
 from softmode.cli.objects import ObjectsExport, ObjectsList, ObjectsShow
+from softmode.cli.plain import plain_output
 from softmode.cli.play import Play
 from softmode.cli.radiance import RadianceBake, RadianceInfo
 from softmode.cli.record import Record
@@ -23,6 +25,7 @@ from softmode.cli.splat import SplatConvert, SplatFromMesh, SplatInfo, SplatShow
 from softmode.cli.train import Evaluate, Export, Train
 from softmode.cli.view import View
 from softmode.errors import SoftmodeError, needs_extra
+from softmode.interrupts import ending_on_sigterm
 
 FIRST_STEPS = """softmode simulates soft objects made of splats or meshes, and robots that grasp them. To begin with:
 
@@ -37,7 +40,19 @@ softmode list-envs lists the tasks, softmode --help the commands, softmode play 
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command line; errors that softmode expects print one line and return 2, an interruption returns 130."""
+    """Run the command line; return the exit code.
+
+    Errors that softmode expects print one line and return 2, Ctrl-C returns 130, SIGTERM 143.
+    """
+    with ending_on_sigterm() as ended, contextlib.ExitStack() as stack:
+        with contextlib.suppress(AttributeError):  # of a stream that is none of Python's own
+            sys.stdout.reconfigure(errors="replace")  # pyright: ignore[reportAttributeAccessIssue]
+        code = _run(arguments, stack)
+    return ended[0] if ended else code
+
+
+def _run(arguments: list[str] | None, stack: contextlib.ExitStack) -> int:
+    """Run the command that is asked for; return its exit code. What it writes is plain until the stack is closed."""
     given = sys.argv[1:] if arguments is None else arguments
     if given == ["--version"]:
         print(f"softmode {__version__}")
@@ -70,9 +85,14 @@ def main(arguments: list[str] | None = None) -> int:
         objects = one_of({"list": ObjectsList, "show": ObjectsShow, "export": ObjectsExport})
         kinds |= Annotated[objects, subcommand("objects", description="List, draw and write the preset objects.")]
         config = (tyro.conf.PositionalRequiredArgs, tyro.conf.DisallowNone)
-        return tyro.cli(kinds, prog="softmode", args=arguments, config=config).run()
+        command = tyro.cli(kinds, prog="softmode", args=arguments, config=config)
+        stack.enter_context(plain_output())
+        return command.run()
     except SoftmodeError as error:
         print(f"softmode: error: {error}", file=sys.stderr)
+        return 2
+    except MemoryError as error:
+        print(f"softmode: error: more memory is asked for than there is. {error}".rstrip(". "), file=sys.stderr)
         return 2
     except OSError as error:
         print(f"softmode: error: {error}. Check the path and the free space", file=sys.stderr)

@@ -6,15 +6,14 @@ import dataclasses
 import importlib.util
 import keyword
 import re
-import shutil
 import string
-import tempfile
 from pathlib import Path
 from typing import Literal
 
 from softmode import __version__
 from softmode.errors import ConfigError
 from softmode.files import storage_errors
+from softmode.leftovers import Claim
 
 TEMPLATES = Path(__file__).parent / "templates" / "task"
 """Files of a package, ``package`` in their names for its name."""
@@ -96,16 +95,15 @@ def write_task(name: str, parent: Path) -> Path:
         "version": __version__,
     }
     with storage_errors(folder):
-        parent.mkdir(parents=True, exist_ok=True)
-        pending = Path(tempfile.mkdtemp(prefix=f".{package}.", dir=parent))
+        claim = Claim(folder)
+        pending = claim.name()
         try:
             for template in sorted(TEMPLATES.rglob("*.txt")):
                 place = template.relative_to(TEMPLATES).with_suffix("").as_posix().replace("package", package)
                 path = pending / place
                 path.parent.mkdir(parents=True, exist_ok=True)
                 path.write_text(string.Template(template.read_text("utf-8")).substitute(words), "utf-8")
-            pending.chmod(0o755)
             pending.rename(folder)
         finally:
-            shutil.rmtree(pending, ignore_errors=True)
+            claim.release()
     return folder

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-import fcntl
 import os
-import secrets
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,6 +15,7 @@ from softmode.demonstrations.schema import INDEX_FEATURES, Feature, write_json, 
 from softmode.demonstrations.statistics import Statistics, combine
 from softmode.errors import ConfigError
 from softmode.files import storage_errors, sync
+from softmode.leftovers import Claim, lock
 
 STAGE = ".recording"
 """Folder inside a dataset where files of an unfinished episode are written."""
@@ -98,7 +96,7 @@ class DatasetWriter:
         """Frames in the dataset, those of the present episode not counted."""
         self._films_done = -1  # number of the last film
         self._root, self._is_new, self._lock = self.folder, False, None
-        self._made: list[Path] = []
+        self._claim: Claim | None = None
         self._episode: Episode
         try:
             with storage_errors(f"dataset {self.folder}", hint="choose another folder"):
@@ -117,22 +115,16 @@ class DatasetWriter:
         self._begin()
 
     def _make_root(self) -> None:
-        """Make the folder under a name of its own; it takes its place with the first episode."""
-        self._made = [parent for parent in self.folder.parents if not parent.exists()]
-        self.folder.parent.mkdir(parents=True, exist_ok=True)
-        root = self.folder.with_name(f".{self.folder.name}.{secrets.token_hex(6)}.tmp")
-        root.mkdir()
-        self._root, self._is_new = root, True
+        """Make the folder under a name of its own; it takes its place, its parents made, with the first episode."""
+        self._claim = Claim(self.folder)
+        self._root, self._is_new = self._claim.name(), True
+        self._root.mkdir()
 
     def _take_lock(self) -> None:
         """Hold the folder against a second writer."""
         self._lock = os.open(self._root, os.O_RDONLY)
-        try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise ConfigError(
-                f"{self.folder} is being written by another recording", hint="wait for its end"
-            ) from error
+        if not lock(self._lock):
+            raise ConfigError(f"{self.folder} is being written by another recording", hint="wait for its end")
 
     def _continue(self) -> None:
         """Read the state of the dataset that is there."""
@@ -277,7 +269,8 @@ class DatasetWriter:
         if self._is_new:
             shutil.rmtree(stage)
             os.rename(self._root, self.folder)  # replaces an empty folder, and fails on any other
-            self._root, self._is_new, self._made = self.folder, False, []
+            self._root, self._is_new = self.folder, False
+            self._drop_claim()
         self._rows, self._tables, self._file = rows, tables, file
         self._tasks, self._statistics, self._origins = tasks, total, origins
         self.episode_count, self.frame_count = number + 1, start + count
@@ -326,15 +319,15 @@ class DatasetWriter:
     def _release(self) -> None:
         """Let go of the folder, and remove what was made and not completed."""
         if self._lock is not None:
-            shutil.rmtree(self._root if self._is_new else self._root / STAGE, ignore_errors=True)
+            shutil.rmtree(self._root / STAGE, ignore_errors=True)
             os.close(self._lock)
             self._lock = None
-        elif self._is_new:
-            shutil.rmtree(self._root, ignore_errors=True)
-        for parent in self._made:
-            with contextlib.suppress(OSError):
-                parent.rmdir()
-        self._made = []
+        self._drop_claim()
+
+    def _drop_claim(self) -> None:
+        """Remove what a new folder did not become."""
+        if self._claim is not None:
+            self._claim.release()
 
     def __enter__(self) -> DatasetWriter:
         """Return the writer."""

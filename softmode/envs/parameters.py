@@ -117,7 +117,8 @@ def check_options(
         world_count: Number of worlds.
 
     Raises:
-        ConfigError: If a name is unknown, or a value no finite number within its range.
+        ConfigError: If a name is unknown, a value no finite number within its range, or a material one in which sound
+            is faster than in what is soft: contacts of what is so light and stiff may let steps diverge.
     """
     unknown = sorted(set(options) - set(parameters))
     if unknown:
@@ -125,7 +126,26 @@ def check_options(
             hint = "choose it when the environment is made, by order or seed of the ObjectSet"
             raise ConfigError("'object' is no reset option: a world keeps its object", hint=hint)
         raise ConfigError(f"unknown reset options {unknown}", hint=f"use {', '.join(parameters)}")
-    return {name: _checked(parameters[name], value, world_count) for name, value in options.items()}
+    found = {name: _checked(parameters[name], value, world_count) for name, value in options.items()}
+    if _ELASTIC & set(found) and set(parameters) >= _ELASTIC:
+        _check_speed({n: found.get(n, np.array(p.low if n == "density" else p.high)) for n, p in parameters.items()})
+    return found
+
+
+_ELASTIC = {"youngs_modulus", "poissons_ratio", "density"}
+_SPEED = 1.0e3
+"""Fastest compression wave of a material that a reset option may ask for [m/s]; at three times that steps diverged."""
+
+
+def _check_speed(values: Mapping[str, NDArray[np.floating]]) -> None:
+    """Refuse materials beyond the speed; where no value is given the fastest that may be drawn counts."""
+    modulus, ratio, density = (values[name].astype(float) for name in ("youngs_modulus", "poissons_ratio", "density"))
+    speed = np.sqrt(modulus * (1.0 - ratio) / ((1.0 + ratio) * (1.0 - 2.0 * ratio) * density)).max()
+    if speed > _SPEED:
+        raise ConfigError(
+            f"youngs_modulus, poissons_ratio and density make a sound of {speed:.3g} m/s, over {_SPEED:.0f} m/s",
+            hint="give a lower youngs_modulus or poissons_ratio, or a higher density",
+        )
 
 
 def _checked(parameter: Parameter, value: object, world_count: int) -> NDArray[np.float32]:

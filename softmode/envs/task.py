@@ -394,8 +394,8 @@ class Task:
                 name="yaw", low=(-config.yaw_range,), high=(config.yaw_range,), least=(-math.tau,), most=(math.tau,)
             ),
             ranged("youngs_modulus", 1.0e2, 1.0e11, log=True),
-            ranged("poissons_ratio", -0.9, 0.499),
-            ranged("density", 1.0, 2.0e4, log=True),
+            ranged("poissons_ratio", -0.9, 0.49),
+            ranged("density", 10.0, 2.0e4, log=True),
             ranged("friction", 0.0, 10.0),
             ranged("scale", 0.5, 2.0),
             *self._clutter_parameters(),

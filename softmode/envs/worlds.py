@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import contextlib
 import multiprocessing
+import os
+import threading
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -211,7 +213,8 @@ class RemoteWorlds:
 
 
 def _serve(pipe: Connection, task_class: type[Task], arguments: dict[str, Any]) -> None:
-    """Build the worlds and do what the parent says until it hangs up."""
+    """Build the worlds and do what the parent says until it hangs up or dies."""
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     try:
         with wp.ScopedDevice("cpu"):
             worlds = LocalWorlds(task_class, arguments)
@@ -234,6 +237,14 @@ def _serve(pipe: Connection, task_class: type[Task], arguments: dict[str, Any]) 
             pipe.send(answer)
     except (EOFError, KeyboardInterrupt, ConnectionError):
         return
+
+
+def _end_with_parent() -> None:
+    """End this process when its parent dies, in whatever it is: the pipe does not say so, both ends lie open here."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _portable(error: Exception) -> Exception:

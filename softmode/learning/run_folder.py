@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from softmode.errors import RunError, needs_extra
-from softmode.files import storage_errors, whole_file
+from softmode.files import free_name, storage_errors, whole_file
 
 CONFIG, PROGRESS, LATEST, BEST = "config.json", "progress.csv", "latest.npz", "best.npz"
 """Names of the files of a run."""
@@ -50,11 +50,7 @@ class RunFolder:
     def name_for(root: Path, env: str, name: str | None) -> Path:
         """Return ``root/<Env>/<YYYYmmdd-HHMMSS>[_name]``, a folder that is not there yet."""
         task = env.rpartition(":")[2].rpartition("/")[2]
-        base = root / task / (time.strftime("%Y%m%d-%H%M%S") + (f"_{name}" if name else ""))
-        path, k = base, 1
-        while path.exists():
-            path, k = base.with_name(f"{base.name}-{k}"), k + 1
-        return path
+        return free_name(root / task / (time.strftime("%Y%m%d-%H%M%S") + (f"_{name}" if name else "")))
 
     def write_config(self, config: dict[str, Any]) -> None:
         """Write the configuration of the run."""

@@ -260,40 +260,54 @@ class _Run:
         }
 
     def loop(self) -> None:
-        """Collect and update until a limit is reached."""
-        self.started = saved = time.perf_counter()
-        per_rollout = self.hyperparameters.rollout_steps * self.options.num_envs * self.ranks.count
-        progress = self._progress()
+        """Collect and update until a limit is reached; an interruption writes the last whole iteration."""
+        self.started = time.perf_counter()
+        self._kept = self._checkpoint()
         try:
-            while progress < 1.0:
-                clock = time.perf_counter()
-                self.iteration += 1
-                seed = (self.options.seed * 1_000_003 + self.iteration) * 4099 + self.ranks.rank
-                self.generator.manual_seed(seed)
-                rollout = self.collector.collect(self.generator)
-                collected = time.perf_counter()
-                bad = self.guard.bad(rollout).any() if self.guard else torch.zeros((), device=self.device)
-                losses = self._update(rollout, progress)
-                self.env_steps += per_rollout
-                row, progress, any_bad = self.log.read(losses, bad, self._progress())
-                now = time.perf_counter()
-                told = {"iteration": self.iteration, "env_steps": self.env_steps, "seconds": self._seconds()}
-                told |= {"steps_per_second": per_rollout / (now - clock)}
-                row = {**told, "update_share": (now - collected) / (now - clock), **row}
-                if any_bad or row["skipped_updates"]:
-                    raise self._diverged(rollout, any_bad, bool(bad))
-                if self.guard:
-                    self.guard.keep(rollout)
-                if self.ranks.rank == 0:
-                    self.folder.log(row)
-                    self.report(describe(row))
-                    if progress >= 1.0 or now - saved >= self.options.checkpoint_seconds:
-                        self._save(row)
-                        saved = now
+            try:
+                self._iterate()
+            except RuntimeError:
+                time.sleep(1.0)  # what ends all processes of a run may end one that this one waits for before this one
+                raise
         except KeyboardInterrupt:
             if self.ranks.rank == 0:
-                self.report(f"interrupted; go on from the last checkpoint: --run-dir {self.folder.path} --resume")
+                self._save(self._kept)
+                done = f"interrupted after iteration {self._kept.progress['iteration']}"
+                self.report(f"{done}; go on with --run-dir {self.folder.path} --resume")
             raise
+
+    def _iterate(self) -> None:
+        """Collect and update until a limit is reached."""
+        saved = self.started
+        per_rollout = self.hyperparameters.rollout_steps * self.options.num_envs * self.ranks.count
+        progress = self._progress()
+        while progress < 1.0:
+            clock = time.perf_counter()
+            self.iteration += 1
+            seed = (self.options.seed * 1_000_003 + self.iteration) * 4099 + self.ranks.rank
+            self.generator.manual_seed(seed)
+            rollout = self.collector.collect(self.generator)
+            collected = time.perf_counter()
+            bad = self.guard.bad(rollout).any() if self.guard else torch.zeros((), device=self.device)
+            losses = self._update(rollout, progress)
+            self.env_steps += per_rollout
+            row, progress, any_bad = self.log.read(losses, bad, self._progress())
+            now = time.perf_counter()
+            told = {"iteration": self.iteration, "env_steps": self.env_steps, "seconds": self._seconds()}
+            told |= {"steps_per_second": per_rollout / (now - clock)}
+            row = {**told, "update_share": (now - collected) / (now - clock), **row}
+            if any_bad or row["skipped_updates"]:
+                raise self._diverged(rollout, any_bad, bool(bad))
+            if self.guard:
+                self.guard.keep(rollout)
+            if self.ranks.rank == 0:
+                self.folder.log(row)
+                self.report(describe(row))
+                if progress >= 1.0 or now - saved >= self.options.checkpoint_seconds:
+                    better = self._is_best(row)
+                    self._save(self._checkpoint(), better)
+                    saved = now
+                self._kept = self._checkpoint()
 
     def _update(self, rollout: Rollout, progress: float) -> torch.Tensor:
         """Update networks, then the scales of observations and rewards, which thus are those of the whole rollout."""
@@ -327,37 +341,40 @@ class _Run:
             hint=f"find the cause with --run-dir {self.folder.path} --resume --nan-guard, or lower the learning rate",
         )
 
-    def _save(self, row: dict[str, Any]) -> None:
-        """Write the latest checkpoint, and the best where this is it."""
+    def _is_best(self, row: dict[str, Any]) -> bool:
+        """Return whether no checkpoint before was as good, and note how good this is."""
         # JSON has no infinity.
         success, mean = (-sys.float_info.max if row[name] is None else row[name] for name in ("success", "return"))
         score = (success, mean)
         better = self.log.episodes >= min(WINDOW, 2 * self.options.num_envs) and score > self.best
         if better:
             self.best = score
-        self._write(LATEST)
-        if better or not (self.folder.path / BEST).exists():
-            self._write(BEST)
+        return better
 
-    def _write(self, name: str) -> None:
-        arrays: dict[str, np.ndarray] = {}
+    def _save(self, checkpoint: Checkpoint, better: bool = False) -> None:
+        """Write the latest checkpoint, and the best where this is it or there is none."""
+        for name in (LATEST, BEST) if better or not (self.folder.path / BEST).exists() else (LATEST,):
+            with self.folder.writing(name):
+                write_checkpoint(checkpoint, self.folder.path / name)
+
+    def _checkpoint(self) -> Checkpoint:
+        """Return what the run goes on from, in memory of its own."""
+        arrays: dict[str, torch.Tensor] = {}
         for prefix, module in self._modules().items():
-            arrays |= {f"{prefix}.{key}": value.cpu().numpy() for key, value in module.state_dict().items()}
-        arrays |= {f"optimizer.{key}": value.cpu().numpy() for key, value in self.ppo.optimizer.state().items()}
+            arrays |= {f"{prefix}.{key}": value for key, value in module.state_dict().items()}
+        arrays |= {f"optimizer.{key}": value for key, value in self.ppo.optimizer.state().items()}
         progress = {"iteration": self.iteration, "env_steps": self.env_steps, "seconds": self._seconds()}
         progress |= {"seed": self.options.seed, "resumed": self.resumed}
         progress |= {"best_success": self.best[0], "best_return": self.best[1]}
-        checkpoint = Checkpoint(
+        return Checkpoint(
             env=self.options.env,
             env_options=self.options.env_options,
             interface=self.env.interface,
             privileged=self.privileged,
             hyperparameters=self.hyperparameters,
             progress=progress,
-            arrays=arrays,
+            arrays={name: value.cpu().numpy().copy() for name, value in arrays.items()},
         )
-        with self.folder.writing(name):
-            write_checkpoint(checkpoint, self.folder.path / name)
 
     def finish(self) -> TrainResult:
         """Evaluate the last policy on the first rank."""

@@ -14,6 +14,7 @@ import numpy as np
 import warp as wp
 
 from softmode.checks import require_choice, require_fields
+from softmode.deformables.coupling.rigid_solver import mujoco_warnings
 from softmode.errors import AssetError, ConfigError
 
 ToolPose = tuple[float, float, float, float, float, float, float]
@@ -127,6 +128,7 @@ class RobotDescription:
         """Names of the joints without a drive."""
         return tuple(name for name, drive in zip(self.joint_names, self.drives, strict=True) if drive is None)
 
+    @mujoco_warnings()
     def joint_inertias(self) -> np.ndarray:
         """Return what each joint accelerates in the home pose, the others held [kg or kg m^2], shape (joint_count,)."""
         mujoco = importlib.import_module("mujoco")

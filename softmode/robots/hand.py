@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from softmode.deformables.coupling.rigid_solver import mujoco_warnings
+
 if TYPE_CHECKING:
     from softmode.robots.description import JointDrive
 
@@ -154,6 +156,7 @@ def closing_ends(
     return {j: pair for j, pair in ends.items() if way[j] >= least}
 
 
+@mujoco_warnings()
 def settled(model: Any, joint_q: Array, moving: Sequence[int]) -> Any:
     """Return the kinematics of a robot whose loops are closed, by Gauss-Newton steps of its passive joints.
 

@@ -18,6 +18,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from softmode.checks import require_number
+from softmode.deformables.coupling.rigid_solver import mujoco_warnings
 from softmode.errors import AssetError, ConfigError
 from softmode.foreign import process
 from softmode.foreign.tokens import SUFFIXES
@@ -178,6 +179,7 @@ def _locate(source: str | Path, asset_root: str | Path | None, download: bool) -
     return RobotAsset(name=path.stem, path=path, asset_root=folder, root_given=asset_root is not None)
 
 
+@mujoco_warnings()
 def _read(asset: RobotAsset) -> tuple[Any, list[str]]:
     """Return the editable MuJoCo specification of a file whose references have been checked, and notes."""
     if asset.path.suffix.lower() in SUFFIXES:
@@ -242,6 +244,7 @@ def _mended(inertia: ElementTree.Element) -> bool:
     return True
 
 
+@mujoco_warnings()
 def _compile(spec: Any, asset: RobotAsset, notes: list[str] | None = None) -> Any:
     """Compile a specification; errors of the compiler name the file. Links without mass that move get a little."""
     try:

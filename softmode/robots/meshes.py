@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-from softmode.deformables.build.cache import cache_directory, fingerprint_of, writable_cache
+from softmode.deformables.build.cache import cache_directory, fingerprint_of, is_trusted, writable_cache
 from softmode.errors import AssetError, MissingExtraError, needs_extra
 from softmode.files import whole_file
 from softmode.foreign import process
@@ -98,7 +98,7 @@ def _readable(file: Path, asset: RobotAsset) -> Path:
     name = fingerprint_of("robot mesh 1", suffix, file)
     folder = cache_directory() / "robot_meshes"
     for made in (folder / f"{name}.stl", folder / f"{name}.obj"):
-        if made.is_file():
+        if is_trusted(made):
             return made
     mesh = _read(file, asset)
     made = writable_cache(folder) / f"{name}{'.stl' if len(mesh.faces) <= _STL_FACES else '.obj'}"

@@ -25,7 +25,8 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from softmode.deformables.build.cache import cache_directory, fingerprint_of, writable_cache
+from softmode.deformables.build.cache import cache_directory, fingerprint_of, is_trusted, writable_cache
+from softmode.deformables.coupling.rigid_solver import mujoco_warnings
 from softmode.errors import AssetError, SoftmodeError, needs_extra
 from softmode.files import whole_file
 from softmode.foreign import process
@@ -255,7 +256,7 @@ class _Translation:
         name = f"mesh_{fingerprint_of('stage mesh 1', points, faces)}"
         if self.spec.mesh(name) is None:
             file = cache_directory() / "robot_meshes" / f"{name}.obj"
-            if not file.is_file():
+            if not is_trusted(file):
                 writable_cache(file.parent)
                 text = trimesh.Trimesh(points, faces, process=False).export(file_type="obj", digits=9)
                 with whole_file(file, "mesh") as target:
@@ -363,6 +364,7 @@ class _Translation:
                     setattr(made, f"{limit}range", [low, high])
                     setattr(made, f"{limit}limited", True)
 
+    @mujoco_warnings()
     def _inertias(self) -> dict[str, float]:
         """Return what each hinge or slide moves at zero coordinates, by name."""
         model, data = self._compiled()
@@ -394,6 +396,7 @@ class _Translation:
         which = "joint states" if states else "targets of drives"
         self.notes.append(f"key frame 'home': {which} of the stage")
 
+    @mujoco_warnings()
     def _compiled(self) -> tuple[Any, Any]:
         """Return the model of what has been added so far, and its data; links without mass get a little."""
         spec = self.spec.copy()

@@ -26,6 +26,7 @@ from softmode.deformables.tools.gaps import rigid_gaps
 from softmode.deformables.tools.grips import GripOptions, Grips, add_grip_slots
 from softmode.errors import ConfigError
 from softmode.objects.placed import Placed
+from softmode.pause import cut_circles
 from softmode.radiance.march import MarchOptions, RadianceMarch
 from softmode.scenes.binding import BoundSplats
 from softmode.scenes.capture import capture_graph, capture_step, require_even
@@ -136,6 +137,7 @@ class SplatScene:
             if grip_slots:
                 add_grip_slots(builder, instance, grip_slots)
         self.model: Any = builder.finalize(device=device)  # Any: it carries the attributes of soft bodies
+        cut_circles(self.model)
         moving = movable_bodies(self.model)
         self.notes: tuple[str, ...] = ()
         """What the scene decided by itself."""

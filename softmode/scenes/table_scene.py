@@ -27,6 +27,7 @@ from softmode.objects.loader import Progress, load
 from softmode.objects.object_set import ObjectSet
 from softmode.objects.placed import Placed
 from softmode.objects.soft_object import SoftObject
+from softmode.pause import cut_circles
 from softmode.robots import control_kernels
 from softmode.robots.arm import ArmDescription
 from softmode.robots.control import ArmControlOptions
@@ -289,6 +290,7 @@ class TableScene:
             for m in self._member:
                 builder.add_world(worlds[m])
         self.model: Any = builder.finalize(device=self.device)  # Any: it carries the attributes of soft bodies
+        cut_circles(self.model, builder, *worlds)
 
     def _world(self, first: SoftObject, material: Material) -> newton.ModelBuilder:
         """Return a world with arm, table, fixtures and objects; the first of these and its material are given."""

@@ -23,6 +23,7 @@ import numpy as np
 from softmode.checks import require_number
 from softmode.deformables.build.patch import Patch
 from softmode.errors import ConfigError, SoftmodeError, needs_extra
+from softmode.files import free_name
 from softmode.view.live_types import Hit, Vector
 from softmode.view.panel import Command, MouseMode, Panel
 from softmode.view.stage import Stage
@@ -299,9 +300,10 @@ class ViewApp:
             size = float(np.linalg.norm(np.ptp(session.object.body.bounds, axis=0)))
             session.paint(self._touched, factor, radius=radius * size, depth=depth * size)
 
-    def _record_path(self) -> Path:
-        """Name the next recording."""
-        return self.options.record_folder / f"{time.strftime('view-%Y%m%d-%H%M%S')}.{self.options.record_as}"
+    def _record_path(self, kind: str | None = None) -> Path:
+        """Name the next recording, or another file beside it of a kind of its own."""
+        name = f"{time.strftime('view-%Y%m%d-%H%M%S')}.{kind or self.options.record_as}"
+        return free_name(self.options.record_folder / name)
 
 
 @dataclass(frozen=True, kw_only=True)

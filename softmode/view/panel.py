@@ -78,7 +78,7 @@ class Panel:
         session: Whose values they start with.
         submit: Takes what shall be done with the session.
         on_mode: Called with the mode of the mouse when it is chosen, in the thread that runs the session.
-        record_path: Names the next recording.
+        record_path: Names the next recording, or a file of another suffix.
         on_prepare: Called when a person asks to turn and crop the capture; None has no button for it.
     """
 
@@ -89,7 +89,7 @@ class Panel:
         *,
         submit: Callable[[Command], None],
         on_mode: Callable[[MouseMode], None],
-        record_path: Callable[[], Path],
+        record_path: Callable[..., Path],
         on_prepare: Callable[[], None] | None = None,
     ) -> None:
         """Build the controls."""
@@ -183,7 +183,7 @@ class Panel:
 
     def _save(self, session: LiveSession) -> None:
         """Write the object beside the recordings."""
-        path = self._record_path().with_suffix(".npz")
+        path = self._record_path("npz")
         session.save(path)
         self.tell(f"wrote {path}")
 

@@ -67,8 +67,8 @@ def _coordinates(path: Path, objects: Sequence[SoftObject]) -> Recorder:
         body_q = poses.astype(np.float32).reshape(len(times), -1, 7)
         moved = {"q": q, "dent": dent, "body_q": body_q}
         recording = LiveRecording(times=times.astype(np.float64), fingerprints=prints, **moved)
-        recording.save(pending.temporary)
-        pending.publish()
+        with pending:
+            recording.save(pending.temporary)
 
     return Recorder(path, take, finish, pending.discard)
 

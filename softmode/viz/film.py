@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from softmode.errors import ConfigError, needs_extra
-from softmode.files import PendingFile
+from softmode.files import PendingFile, storage_errors
 
 if TYPE_CHECKING:
     import numpy as np
@@ -60,7 +60,11 @@ class Film:
         self.discard()
 
     def add(self, frame: NDArray[np.uint8], fps: int) -> None:
-        """Append a frame."""
+        """Append a frame.
+
+        Raises:
+            StorageError: If the encoder stopped, as it does when the disk is full.
+        """
         import numpy as np
 
         if self._writer is None:
@@ -74,7 +78,11 @@ class Film:
             size = (frame.shape[1], frame.shape[0])
             self._writer = write_frames(self._file.temporary, size, fps=fps, **how)
             self._writer.send(None)
-        self._writer.send(np.ascontiguousarray(frame))
+        with storage_errors(f"video {self.path}"):
+            try:
+                self._writer.send(np.ascontiguousarray(frame))
+            except StopIteration as error:
+                raise OSError("the encoder stopped") from error
         if self._count % self._stride == 0:
             self._frames.append(frame)
         self._count += 1
@@ -82,7 +90,16 @@ class Film:
             self._frames, self._stride = self._frames[::2], 2 * self._stride
 
     def publish(self) -> None:
-        """Put video and contact sheet in place."""
+        """Put video and contact sheet in place.
+
+        Raises:
+            StorageError: If they cannot be written.
+        """
+        with storage_errors(f"video {self.path}"):
+            self._publish()
+
+    def _publish(self) -> None:
+        """Finish the video, draw the sheet, put both in place."""
         import numpy as np
         from PIL import Image
 
@@ -104,5 +121,4 @@ class Film:
         if self._writer is not None:
             with contextlib.suppress(Exception):  # an encoder that was interrupted too has nothing left to say
                 self._writer.close()
-        self._sheet.unlink(missing_ok=True)
         self._file.discard()

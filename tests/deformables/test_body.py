@@ -6,8 +6,12 @@ Builds small capsules and default bodies: the build is what it tests.
 from __future__ import annotations
 
 import dataclasses
+import fcntl
 import json
 import multiprocessing
+import os
+import shutil
+import threading
 import time
 from pathlib import Path
 
@@ -16,15 +20,16 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.body.reduced_body import FORMAT_VERSION, ReducedBody
 from softmode.deformables.body.regions import Region
+from softmode.deformables.build import cache
 from softmode.deformables.build.build_body import body_fingerprint, build_body
 from softmode.deformables.build.cache import cache_directory, cached_body, fingerprint_of
 from softmode.deformables.build.functions import RANK_TOLERANCE
 from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.build.quadrature import quadrature_from_box, quadrature_from_capsule, quadrature_from_sphere
 from softmode.deformables.build.quadrature_grid import Quadrature
-from softmode.errors import AssetError, BasisError, ConfigError, MaterialError
+from softmode.errors import AssetError, BasisError, ConfigError, MaterialError, StorageError
 from tests.bodies import assert_same
 
 SMALL = BuildOptions(mode_count=4, kernel_count=80, cubature_count=48)
@@ -411,6 +416,59 @@ def test_damaged_cache_entry_is_rebuilt(body: ReducedBody, tmp_path: Path) -> No
     entry.write_bytes(entry.read_bytes()[:1000])
     assert_same(cached_body(("k",), lambda: body, directory=tmp_path), body)
     assert_same(ReducedBody.load(entry), body)
+
+
+def test_an_entry_is_read_only_under_its_own_key(body: ReducedBody, tmp_path: Path, monkeypatch) -> None:
+    """A whole body under another key, a link, and another user's file are built anew, in place of what was there."""
+    cached_body(("k",), lambda: body, directory=tmp_path)
+    (entry,) = tmp_path.glob("*.npz")
+    other = tmp_path / f"{fingerprint_of(FORMAT_VERSION, 'other')}.npz"
+    calls = []
+
+    def build() -> ReducedBody:
+        calls.append(1)
+        return body
+
+    shutil.copy(entry, other)
+    cached_body(("other",), build, directory=tmp_path)
+    assert len(calls) == 1
+    kept = tmp_path / "elsewhere.bin"
+    other.rename(kept)
+    other.symlink_to(kept)
+    before = kept.read_bytes()
+    cached_body(("other",), build, directory=tmp_path)
+    assert len(calls) == 2 and not other.is_symlink() and kept.read_bytes() == before
+    if os.getuid() == 0:
+        os.chown(other, 12345, -1)
+        cached_body(("other",), build, directory=tmp_path)
+        assert len(calls) == 3 and other.stat().st_uid == 0
+    cached_body(("other",), build, directory=tmp_path)
+    assert len(calls) == 2 + (os.getuid() == 0)
+
+
+def test_a_lock_is_waited_for_aloud(body: ReducedBody, tmp_path: Path, monkeypatch, capfd) -> None:
+    """After a while it is said which file another process holds; a link in the lock's place is a typed error."""
+    monkeypatch.setattr(cache, "_SILENCE", 0.05)
+    path = tmp_path / f"{fingerprint_of(FORMAT_VERSION, 'k')}.lock"
+    with path.open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        threading.Timer(0.5, fcntl.flock, (file, fcntl.LOCK_UN)).start()
+        assert_same(cached_body(("k",), lambda: body, directory=tmp_path), body)
+    err = capfd.readouterr().err
+    assert err.count("waiting for another process") == 1 and str(path) in err
+    (tmp_path / f"{fingerprint_of(FORMAT_VERSION, 'l')}.lock").symlink_to(tmp_path / "made by the lock")
+    with pytest.raises(StorageError):
+        cached_body(("l",), lambda: body, directory=tmp_path)
+    assert not (tmp_path / "made by the lock").exists()
+    with pytest.raises(StorageError, match="cache folder"):
+        cached_body(("m",), lambda: body, directory=path / "below a file")
+
+
+def test_the_folder_of_the_cache_may_begin_with_a_tilde(tmp_path: Path, monkeypatch) -> None:
+    """It is the home folder, not a folder of that name."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("SOFTMODE_CACHE", "~/bodies of mine")
+    assert cache_directory() == tmp_path / "bodies of mine"
 
 
 def test_failed_build_is_not_cached(body: ReducedBody, tmp_path: Path) -> None:

@@ -6,8 +6,6 @@ import json
 import os
 import shutil
 import signal
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +17,11 @@ from hypothesis import strategies as st
 from softmode.demonstrations import Dataset, DatasetWriter, Feature, read_dataset
 from softmode.errors import AssetError, ConfigError, SoftmodeError, StorageError
 from tests.demonstrations.episodes import CAMERA, FPS, episode, features, write
+from tests.faults import at_every_call, interrupt, run
 
 pq: Any = pytest.importorskip("pyarrow.parquet")
 pa: Any = pytest.importorskip("pyarrow")
 
-ROOT = Path(__file__).resolve().parents[2]
 LENGTHS = (5, 8, 3)
 
 
@@ -330,47 +328,34 @@ def test_png_damage_and_size(tmp_path: Path):
 def test_interruption_at_every_step_of_saving(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pictures: str):
     """Wherever saving is cut off, the dataset reads as before or with the episode, and recording goes on."""
     write(tmp_path / "start", LENGTHS[:2], pictures)
-    real, cuts = os.replace, 0
-    while True:
+    cuts = 0
+    for cuts in at_every_call(monkeypatch, os, "replace", interrupt):
         folder = tmp_path / f"d{cuts}"
         shutil.copytree(tmp_path / "start", folder)
-        left = cuts
-
-        def replace(source: Any, target: Any) -> None:
-            nonlocal left
-            if left == 0:
-                raise KeyboardInterrupt
-            left -= 1
-            real(source, target)
-
-        monkeypatch.setattr(os, "replace", replace)
         try:
             write(folder, (LENGTHS[2],), pictures, first=2, append=True)
         except KeyboardInterrupt:
-            monkeypatch.undo()
-        else:
-            break
-        assert read_dataset(folder).episode_count == 2
-        write(folder, (LENGTHS[2],), pictures, first=2, append=True)
+            assert read_dataset(folder).episode_count == 2
+            write(folder, (LENGTHS[2],), pictures, first=2, append=True)
         whole = [episode(k, length, True) for k, length in enumerate(LENGTHS)]
         assert_holds(read_dataset(folder), whole, film=pictures == "video")
         assert len(pq.read_table(folder / DATA)) == sum(LENGTHS)
         assert len(pq.read_table(folder / ROWS)) == len(LENGTHS)
-        cuts += 1
     assert cuts == 5 + (pictures == "video")  # film, data, tasks, episodes, stats, info
 
 
 KILLED = """
-import os, signal, sys
+import sys
 from pathlib import Path
 from softmode.demonstrations import DatasetWriter
 from tests.demonstrations.episodes import FPS, episode, features
+from tests.faults import die
 writer = DatasetWriter(Path(sys.argv[1]), features("video"), fps=FPS)
 for number, length in enumerate((5, 8, 3)):
     for k, frame in enumerate(episode(number, length, True)):
         writer.add_frame(frame)
         if (number, k) == (int(sys.argv[2]), 1):
-            os.kill(os.getpid(), signal.SIGKILL)
+            die()
     writer.save_episode("lift the toy")
 """
 
@@ -378,27 +363,21 @@ for number, length in enumerate((5, 8, 3)):
 @pytest.mark.parametrize("number", [0, 2])
 def test_killed_process(tmp_path: Path, number: int):
     """Killed within its third episode a recording leaves two; killed within its first, no folder. Both can go on."""
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(
-        [sys.executable, "-c", KILLED, str(tmp_path / "d"), str(number)], env=environment, check=False
-    )
-    assert done.returncode == -signal.SIGKILL
+    assert run(KILLED, tmp_path / "d", number)[0] == -signal.SIGKILL
     assert (tmp_path / "d").exists() == (number == 2)
     if number:
         found = read_dataset(tmp_path / "d")
         assert_holds(found, [episode(k, LENGTHS[k], True) for k in range(2)], film=True)
     write(tmp_path / "d", (3,), "video", first=number, append=True)
     assert read_dataset(tmp_path / "d").episode_count == number + 1
-    assert not list((tmp_path / "d").glob(".*"))
+    assert not list((tmp_path / "d").glob(".*")) and [path.name for path in tmp_path.iterdir()] == ["d"]
 
 
 FULL = """
-import resource, sys
 from pathlib import Path
 from softmode.demonstrations import DatasetWriter, Feature
 from softmode.errors import StorageError
 import numpy as np
-resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
 kind = sys.argv[2]
 wanted = {"picture": Feature(dtype=kind, shape=(256, 256, 3))}
 random = np.random.default_rng(0)
@@ -420,15 +399,9 @@ with DatasetWriter(Path(sys.argv[1]), wanted, fps=30) as writer:
 @pytest.mark.parametrize("kind", ["image", "video"])
 def test_full_disk(tmp_path: Path, kind: str):
     """Where a file cannot grow, saving raises StorageError, the episodes before stay, and smaller ones can follow."""
-    done = subprocess.run(
-        [sys.executable, "-c", FULL, str(tmp_path / "d"), kind],
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.lower().count("free some space") == 2
+    code, written = run(FULL, tmp_path / "d", kind, disk=100_000)
+    assert code == 0, written
+    assert written.lower().count("free some space") == 2
     found = read_dataset(tmp_path / "d")
     assert found.episode_count == 2 and found.frame_count == 2
     assert not list((tmp_path / "d").glob(".*"))

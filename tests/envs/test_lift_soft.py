@@ -68,6 +68,37 @@ def test_seed_decides_the_draw_and_the_stream_goes_on(lift: LiftSoftEnv) -> None
     assert not np.array_equal(lift.reset(seed=6)[0], first)
 
 
+def test_a_seeded_reset_leaves_nothing_of_before(lift: LiftSoftEnv) -> None:
+    """All that a step reads has the same bits after it, MuJoCo's clock included.
+
+    Where the body was before, and its Hessian, are not read in the first step: `dt_before` and `cached` say so. A step
+    writes actions and reward first.
+    """
+    lift.reset(seed=5)
+    first = lift.get_state()
+    for _ in range(3):
+        lift.step(lift.action_space.high)
+    lift.reset()
+    lift.step(lift.action_space.low)
+    lift.reset(seed=5)
+    second = lift.get_state()
+    assert first.arrays.keys() == second.arrays.keys() and "mujoco.time" in first.arrays
+    different = [name for name in first.arrays if first.arrays[name].tobytes() != second.arrays[name].tobytes()]
+    unread = ("_before", "stick_point", "hessian.", "scene.actions", "task.reward")
+    assert not [name for name in different if not any(part in name for part in unread)]
+    assert not {"state.softmode.dt_before", "hessian.cached"} & set(different) and first.random == second.random
+
+
+def test_materials_in_which_sound_is_too_fast_are_refused(lift: LiftSoftEnv) -> None:
+    """The speed sqrt(E (1 - nu) / ((1 + nu) (1 - 2 nu) rho)) is at most 1 km/s: beyond steps have diverged."""
+    light = {"density": 100.0, "poissons_ratio": 0.45}
+    modulus = 1.0e6 * 100.0 * 1.45 * 0.1 / 0.55
+    assert lift.reset(options={**light, "youngs_modulus": 0.99 * modulus})[1]["parameters"]["density"] == 100.0
+    for refused in ({**light, "youngs_modulus": 1.01 * modulus}, {"youngs_modulus": 1.0e11}):
+        with pytest.raises(ConfigError, match="sound"):
+            lift.reset(options=refused)
+
+
 def test_reset_draws_within_its_ranges(lift: LiftSoftEnv) -> None:
     """Position and Young's modulus stay inside the configured ranges and use them."""
     config = lift.config

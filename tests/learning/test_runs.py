@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -18,12 +15,12 @@ from softmode.errors import CheckpointError, ConfigError, RunError, TrainingDive
 from softmode.learning.checkpoints import read_checkpoint
 from softmode.learning.hyperparameters import Hyperparameters
 from softmode.learning.train_options import TrainOptions
+from tests import faults
 from tests.learning.point_env import PointVectorEnv
 from tests.needs import needs
 
 pytestmark = needs("torch")
 
-ROOT = Path(__file__).resolve().parents[2]
 SMALL = Hyperparameters(rollout_steps=8, epochs=2, minibatches=2, hidden=(16,), discount=0.9)
 
 
@@ -97,39 +94,37 @@ def test_resumption_goes_on_where_the_run_was(tmp_path: Path):
     assert seconds == sorted(seconds)
 
 
+TRAIN = ["train", "Pendulum-v1", "--num-envs", "2", "--eval-episodes", "0", "--set", "rollout_steps=32", "hidden=[8]"]
+
+
 def test_a_killed_run_goes_on(tmp_path: Path):
     """SIGKILL in the middle leaves a whole checkpoint that the command resumes from."""
     folder = tmp_path / "run"
-    command = [
-        sys.executable,
-        "-m",
-        "softmode.cli.main",
-        "train",
-        "Pendulum-v1",
-        "--run-dir",
-        str(folder),
-        "--num-envs",
-        "2",
-    ]
-    command += ["--eval-episodes", "0", "--checkpoint-seconds", "0", "--set", "rollout_steps=32", "hidden=[8]"]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    process = subprocess.Popen([*command, "--total-steps", "1e9"], env=environment, stdout=subprocess.PIPE, text=True)
-    try:
-        assert process.stdout is not None
-        for line in process.stdout:
-            if line.strip().startswith("20 "):
-                break
-    finally:
-        os.kill(process.pid, signal.SIGKILL)
-        process.wait()
-        if process.stdout:
-            process.stdout.close()
+    command = [*TRAIN, "--run-dir", str(folder), "--checkpoint-seconds", "0"]
+    code = "import sys; from softmode.cli.main import main; sys.exit(main(sys.argv[1:]))"
+    process = faults.start(code, *command, "--total-steps", "1e9")
+    faults.end_at(process, lambda line: line.strip().startswith("20 "), signal.SIGKILL)
     reached = read_checkpoint(folder / "latest.npz").progress["env_steps"]
     assert reached >= 19 * 64
-    assert main([*command[3:], "--total-steps", str(reached + 640), "--resume"]) == 0
+    assert main([*command, "--total-steps", str(reached + 640), "--resume"]) == 0
     assert read_checkpoint(folder / "latest.npz").progress["env_steps"] == reached + 640
     steps = [int(row["env_steps"]) for row in rows(folder)]
     assert steps == list(range(64, reached + 641, 64))
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_an_ended_run_keeps_its_last_iteration(tmp_path: Path, number: signal.Signals, code: int, capfd):
+    """SIGTERM and Ctrl-C write what the last whole iteration left, though no checkpoint was due, and no more."""
+    folder = tmp_path / "run"
+    with faults.signalled(number, lambda: (folder / "progress.csv").exists() and len(rows(folder)) >= 3):
+        assert main([*TRAIN, "--run-dir", str(folder), "--total-steps", "1e9"]) == code
+    out, err = capfd.readouterr()
+    reached = read_checkpoint(folder / "latest.npz").progress["iteration"]
+    assert reached >= 2 and len(rows(folder)) - reached in (0, 1)  # it may end between the row and what is kept
+    assert f"interrupted after iteration {reached}" in out and "Traceback" not in err
+    assert not list(folder.glob(".*"))
+    assert main([*TRAIN, "--run-dir", str(folder), "--total-steps", str(64 * (reached + 2)), "--resume"]) == 0
+    assert [int(row["iteration"]) for row in rows(folder)] == list(range(1, reached + 3))
 
 
 def test_resumption_is_refused_where_it_cannot_work(tmp_path: Path):
@@ -202,25 +197,20 @@ def test_a_full_disk_leaves_the_earlier_checkpoint(tmp_path: Path):
     run(folder, 64)
     kept = (folder / "latest.npz").read_bytes()
     code = """
-import resource, signal, sys
+import sys
 from pathlib import Path
 from softmode.errors import RunError
 from tests.learning.test_runs import run
-signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
 try:
     run(Path(sys.argv[1]), 6400, resume=True)
 except RunError as error:
     print(error)
 """
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(folder)], env=environment, capture_output=True, text=True, check=False
-    )
+    _, written = faults.run(code, folder, disk=4096)
     assert len(kept) > 4096
-    assert "cannot be written" in done.stdout and "--resume" in done.stdout, done.stdout + done.stderr
+    assert "cannot be written" in written and "--resume" in written, written
     assert (folder / "latest.npz").read_bytes() == kept
-    assert not list(folder.glob(".*.tmp"))
+    assert not list(folder.glob(".*"))
     run(folder, 640, resume=True)
 
 

@@ -361,7 +361,9 @@ def test_warnings_of_mujoco_are_pythons(tmp_path, monkeypatch):
     file = tmp_path / "singular.xml"
     file.write_text(SINGULAR)
     with pytest.warns(RuntimeWarning, match="MuJoCo: Inertia matrix is too close to singular"):
-        robots.load(file, end_effector="heavy")
+        robot = robots.load(file, end_effector="heavy")
+    with pytest.warns(RuntimeWarning, match="singular"):
+        dataclasses.replace(robot, mjcf=SINGULAR).joint_inertias()
     with warnings.catch_warnings(), pytest.raises(RuntimeWarning, match="singular"):
         warnings.simplefilter("error", RuntimeWarning)
         robots.load(file, end_effector="heavy")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import signal
 import socket
-import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -23,6 +22,8 @@ from softmode.view.app import ViewApp, ViewOptions
 from softmode.view.gaussians import GaussianBuffer
 from softmode.view.live_types import SplatPicture
 from softmode.view.session import LiveSession
+from tests import faults
+from tests.marks import rest_but
 from tests.needs import needs
 from tests.view.page_client import PageClient
 from tests.view.serving import SAUSAGE, Served, served
@@ -352,25 +353,18 @@ def test_a_recording_is_kept_when_the_command_ends(
     assert film.stat().st_size > 1000 and str(film) in capfd.readouterr().out
 
 
-def test_an_interrupted_command_ends_cleanly(saved: str) -> None:
-    """Ctrl-C while it serves: exit code 0, one line, no traceback."""
+@pytest.mark.parametrize(
+    ("number", "code"), rest_but([(signal.SIGTERM, 143)], [(signal.SIGTERM, 143), (signal.SIGINT, 0)])
+)
+def test_an_interrupted_command_ends_cleanly(saved: str, number: signal.Signals, code: int) -> None:
+    """SIGTERM and Ctrl-C while it serves: one line, no traceback."""
     program = (
         "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # the background ignores it
         f"from softmode.cli.main import main; sys.exit(main(['view', {saved!r}, '--port', '0', '--no-open']))"
     )
-    process = subprocess.Popen(
-        [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-    try:
-        assert process.stdout is not None
-        assert "http://127.0.0.1:" in process.stdout.readline()
-        time.sleep(0.5)
-        process.send_signal(signal.SIGINT)
-        _, err = process.communicate(timeout=60.0)
-    finally:
-        process.kill()
-    assert process.returncode == 0, err
-    assert "stopped" in err and "Traceback" not in err
+    ended, written = faults.end_at(faults.start(program), lambda line: "http://127.0.0.1:" in line, number)
+    assert ended == code, written
+    assert "stopped" in written and "Traceback" not in written
 
 
 def test_an_environment_is_shown_and_followed() -> None:

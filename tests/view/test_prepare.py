@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import shlex
 import signal
 import subprocess
@@ -23,6 +22,7 @@ from softmode.objects.source import object_source
 from softmode.splats import make_plush, read_splats, write_splats
 from softmode.view.app import ViewOptions, _free_port
 from softmode.view.prepare import PreparePage
+from tests.faults import signalled
 from tests.needs import needs
 from tests.view.page_client import PageClient
 
@@ -164,7 +164,7 @@ def test_a_box_without_splats_is_refused_on_the_page(
     capture: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What cannot be built is said on the page, which goes on, and on the console."""
-    port, told = _free_port("127.0.0.1", 0), []
+    port, told, over = _free_port("127.0.0.1", 0), [], threading.Event()
     monkeypatch.setattr("secrets.token_urlsafe", lambda _: "token")
 
     def visit() -> None:
@@ -172,14 +172,13 @@ def test_a_box_without_splats_is_refused_on_the_page(
             for _ in range(2):
                 told.append(pressed(f"http://127.0.0.1:{port}/token/", "build", "no splat"))
         finally:
-            os.kill(os.getpid(), signal.SIGINT)
+            over.set()
 
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
     visitor = threading.Thread(target=visit)
     visitor.start()
     crop = ["--crop", *"10 10 10 11 11 11".split()]
-    assert main(["view", str(capture), "--prepare", *crop, "--port", str(port), "--no-open"]) == 0
+    with signalled(signal.SIGINT, over.is_set):
+        assert main(["view", str(capture), "--prepare", *crop, "--port", str(port), "--no-open"]) == 0
     visitor.join()
-    signal.signal(signal.SIGINT, before)
     assert len(told) == 2 and all(any("lies inside crop" in text for text in texts) for texts in told)
     assert capsys.readouterr().err.count("no splat") == 2

@@ -26,7 +26,7 @@ from softmode.deformables.build.quadrature_grid import Quadrature
 from softmode.deformables.build.region_samples import octants_near, refine_at_faces, sample_regions
 from softmode.deformables.build.sources import Sources, pack_sources
 from softmode.deformables.build.visibility import lips_of, material_of
-from softmode.errors import MaterialError
+from softmode.errors import MaterialError, memory_errors
 
 __all__ = [
     "BuildOptions",
@@ -116,6 +116,7 @@ def build_part(
         return _build(quadrature, options, name, given, stiffness_scale, density_scale, progress, quick=True)
 
 
+@memory_errors("building a body", hint="take fewer kernels, points or functions")
 def _build(
     quadrature: Quadrature,
     options: BuildOptions,

@@ -6,12 +6,15 @@ import atexit
 import contextlib
 import dataclasses
 import hashlib
+import math
 import os
 import shutil
+import stat
 import sys
 import tempfile
 import time
 import warnings
+import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
@@ -20,17 +23,22 @@ import numpy as np
 
 from softmode.deformables.body.reduced_body import FORMAT_VERSION, ReducedBody
 from softmode.errors import AssetError, ConfigError
+from softmode.files import PendingFile, damage_errors, storage_errors
+from softmode.leftovers import lock
 
 Product = TypeVar("Product")
+_SILENCE = 5.0
+"""Time after which it is said that a lock is waited for [s]."""
 
 
 def cached_body(
     key: tuple[Any, ...], build: Callable[[], ReducedBody], *, directory: str | os.PathLike[str] | None = None
 ) -> ReducedBody:
-    """Return the body stored under a key, building it once when it is absent or damaged.
+    """Return the body stored under a key, building it once when it is absent, damaged or not to be trusted.
 
     Processes that ask for one key at a time wait for the first: a lock file guards the build, an atomic rename
-    publishes it.
+    publishes it. An entry holds its key. It is read only if that is what is asked for, and if it is a file, no link, of
+    this user, of root or of whom the folder belongs to.
 
     Args:
         key: Everything the result depends on; see `fingerprint_of` for what can be hashed.
@@ -40,6 +48,9 @@ def cached_body(
 
     Returns:
         The body.
+
+    Raises:
+        StorageError: If it cannot be kept there.
     """
     key = (FORMAT_VERSION, *key)
     return cached("bodies", key, build, ReducedBody.load, ReducedBody.save, directory=directory)
@@ -65,24 +76,51 @@ def cached(
         directory: Folder in place of the one in the cache.
     """
     place = Path(directory) if directory is not None else cache_directory() / folder
-    path = place / f"{fingerprint_of(*key)}.npz"
+    name = fingerprint_of(*key)
+    path = place / f"{name}.npz"
     with contextlib.suppress(AssetError):
-        return read(path)
+        return _checked(path, name, read)
     if directory is None:
         path = writable_cache(place) / path.name
-    path.parent.mkdir(parents=True, exist_ok=True)
     with _locked(path.with_suffix(".lock")):
         with contextlib.suppress(AssetError):
-            return read(path)
+            return _checked(path, name, read)
         made = make()
-        write(made, path)
+        with PendingFile(path, "cache entry") as pending:
+            write(made, pending.temporary)
+            with zipfile.ZipFile(pending.temporary, "a") as archive:
+                archive.comment = name.encode()
     return made
+
+
+def _checked(path: Path, name: str, read: Callable[[Path], Product]) -> Product:
+    """Return what an entry holds.
+
+    Raises:
+        AssetError: If it is not there, damaged, not of this key or not to be trusted.
+    """
+    with damage_errors(f"cache entry {path}", hint="remove it"):
+        if not is_trusted(path):
+            raise FileNotFoundError
+        with zipfile.ZipFile(path) as archive:
+            if archive.comment != name.encode():
+                raise ValueError("it has another key")
+    return read(path)
+
+
+def is_trusted(path: Path) -> bool:
+    """Return whether an entry is a file, no link, of this user, of root or of whom its folder belongs to."""
+    try:
+        found, owners = path.lstat(), {0, path.parent.stat().st_uid}
+    except OSError:
+        return False
+    return stat.S_ISREG(found.st_mode) and found.st_uid in owners | ({os.getuid()} if hasattr(os, "getuid") else set())
 
 
 def cache_directory() -> Path:
     """Return the user's cache folder: the environment variable SOFTMODE_CACHE, or ~/.cache/softmode."""
     override = os.environ.get("SOFTMODE_CACHE")
-    return Path(override) if override else Path.home() / ".cache" / "softmode"
+    return Path(override).expanduser() if override else Path.home() / ".cache" / "softmode"
 
 
 def writable_cache(folder: Path) -> Path:
@@ -97,7 +135,8 @@ def writable_cache(folder: Path) -> Path:
         reason = "not writable"
     except OSError as error:
         reason = error.strerror or str(error)
-    temporary = tempfile.mkdtemp(prefix="softmode-")
+    with storage_errors(f"cache folder {folder}"):
+        temporary = tempfile.mkdtemp(prefix="softmode-")
     atexit.register(shutil.rmtree, temporary, ignore_errors=True)
     os.environ["SOFTMODE_CACHE"] = temporary
     warnings.warn(
@@ -149,26 +188,17 @@ def _feed(digest: hashlib._Hash, value: object) -> None:
 @contextlib.contextmanager
 def _locked(path: Path) -> Iterator[None]:
     """Hold an exclusive lock on a file; the system releases it if the process dies."""
-    with open(path, "a+b") as file:
-        if sys.platform == "win32":
-            import msvcrt
-
-            while True:
-                try:
-                    msvcrt.locking(file.fileno(), msvcrt.LK_LOCK, 1)
-                    break
-                except OSError:
-                    time.sleep(0.05)
-            try:
-                yield
-            finally:
-                file.seek(0)
-                msvcrt.locking(file.fileno(), msvcrt.LK_UNLCK, 1)
-        else:
-            import fcntl
-
-            fcntl.flock(file, fcntl.LOCK_EX)
-            try:
-                yield
-            finally:
-                fcntl.flock(file, fcntl.LOCK_UN)
+    with storage_errors(f"cache folder {path.parent}", hint="set SOFTMODE_CACHE to a folder that can be written to"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
+    try:
+        with storage_errors(f"lock {path}"):
+            end = time.monotonic() + _SILENCE
+            while not lock(file):
+                if time.monotonic() > end:
+                    print(f"softmode: waiting for another process, which holds {path}", file=sys.stderr, flush=True)
+                    end = math.inf
+                time.sleep(0.02)
+        yield
+    finally:
+        os.close(file)

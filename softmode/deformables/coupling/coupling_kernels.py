@@ -90,6 +90,13 @@ def keep_prediction(
         wp.atomic_or(status, w, WORLD_RIGID_NOT_FINITE)
 
 
+@wp.kernel
+def forget_time(mask: wp.array[wp.bool], time_out: wp.array[float]):
+    """Let the clock of the masked worlds begin anew, (world_count,) [s]."""
+    if mask[wp.tid()]:
+        time_out[wp.tid()] = 0.0
+
+
 @struct
 class Inertia:
     """What the mass matrix of the articulations is made of."""

@@ -349,6 +349,11 @@ class SolverCoupledReduced(ReducedSolver):
         """
         self.reduced.reset(state, world_mask, flags)
         self.rigid.reset(state, world_mask, flags)
+        time = self.rigid.mjw_data.time  # which Newton leaves as it is
+        if world_mask is None:
+            time.zero_()
+        else:
+            self.tables.launch(kernels.forget_time, len(time), world_mask, time)
         newton.eval_fk(self.model, present(state.joint_q), present(state.joint_qd), state)
 
 
