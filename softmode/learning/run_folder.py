@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from softmode.errors import RunError, needs_extra
-from softmode.files import storage_errors, whole_file
+from softmode.files import read_json, storage_errors, whole_file
 
 CONFIG, PROGRESS, LATEST, BEST = "config.json", "progress.csv", "latest.npz", "best.npz"
 """Names of the files of a run."""
@@ -66,10 +66,7 @@ class RunFolder:
         Raises:
             RunError: If it cannot be read.
         """
-        try:
-            config = json.loads((self.path / CONFIG).read_text())
-        except (OSError, ValueError, RecursionError) as error:
-            raise RunError(f"{self.path / CONFIG} cannot be read ({error})", hint="start a new run") from error
+        config = read_json(self.path / CONFIG, "configuration", hint="start a new run", error=RunError)
         if not isinstance(config, dict):
             raise RunError(f"{self.path / CONFIG} is no configuration", hint="start a new run")
         return config

@@ -80,8 +80,8 @@ class RadianceGrid:
                 f"{self.name}: the nodes' axes are no rotation times lengths", hint="export it without shear or mirror"
             )
         values = {
-            "density": np.minimum(density, DENSITY_LIMIT).astype(np.float16),
-            "sh": np.clip(sh, -DENSITY_LIMIT, DENSITY_LIMIT).astype(np.float16),
+            "density": np.minimum(density, DENSITY_LIMIT).astype(np.float16, copy=False),
+            "sh": np.clip(sh, -DENSITY_LIMIT, DENSITY_LIMIT).astype(np.float16, copy=False),
             "origin": origin,
             "axes": axes,
         }

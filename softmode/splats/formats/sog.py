@@ -20,11 +20,13 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from softmode.errors import AssetError
+from softmode.files import open_file, open_zip, read_file, resolve_within
 from softmode.splats.formats.common import FREE_BYTES, MAX_RATIO, exp_scales, quats_from_smallest_three, unreadable
 from softmode.splats.splats import MAX_SPLATS, Splats
 
 _META_LIMIT = 16 * 1024 * 1024
 _IMAGE_FILE_LIMIT = 512 * 1024 * 1024
+_WHOLE = "Copy the whole folder, with all .webp files"
 _ARCHIVE_RATIO = 16
 """Largest ratio of unpacked to packed bytes of a large member of an archive; WebP images are packed already."""
 
@@ -44,7 +46,7 @@ def read_sog(path: str | os.PathLike[str]) -> Splats:
         return _decode(str(file), _folder_reader(file))
     if file.suffix.lower() == ".json":
         return _decode(str(file), _folder_reader(file.parent, file.name))
-    with zipfile.ZipFile(file) as archive:
+    with open_file(file, "splat file") as stream, open_zip(stream) as archive:
         return _decode(str(file), _archive_reader(archive, str(file)))
 
 
@@ -67,16 +69,10 @@ def _folder_reader(folder: Path, meta: str = "meta.json") -> _Reader:
     """Return a reader of the members of a SOG folder."""
 
     def read(name: str, limit: int) -> bytes:
-        file = folder / (meta if name == "meta.json" else name)
-        if not file.is_file():
-            raise unreadable(
-                folder / meta, f"member {name} is missing", hint="Copy the whole folder, with all .webp files"
-            )
-        with open(file, "rb") as stream:
-            data = stream.read(limit + 1)
-        if len(data) > limit:
-            raise unreadable(file, f"larger than {limit} bytes", hint="Decimate the asset first")
-        return data
+        if name == "meta.json":  # the file that was named, wherever it lies
+            return read_file(folder / meta, "splat file", limit=limit)
+        file = resolve_within(folder, name, f"splat file {folder / meta}")
+        return read_file(file, f"splat file {folder / meta}: member", limit=limit, hint=_WHOLE)
 
     return read
 
