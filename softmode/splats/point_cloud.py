@@ -22,7 +22,7 @@ _FAR = 1.0e15
 """Coordinates below it have squares and areas that float32 holds [m]."""
 _BLOCK = 1 << 14
 _PRIMES = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
-_POINTS_FREE = 16 << 20
+_POINTS_FREE = 12 << 20
 _HINT = "Give an .npz with points (N, 3), and normals and colors (N, 3) if there are any"
 
 
@@ -110,19 +110,21 @@ def splats_from_points(
         quats[part] = quats_from_rotations(frame * np.sign(np.linalg.det(frame))[:, None, None])
     typical = float(np.median(pitch))
     pitch = np.clip(pitch, 0.5 * typical, 2.0 * typical)[back]
-    shade = np.full((len(x), 3), GREY)
+    shade = np.full((1, 3), GREY)
     if colors is not None:
         shade = _array(f"{name}: colors", colors, len(x))
         if np.issubdtype(np.asarray(colors).dtype, np.integer):
             shade = shade / 255.0
-    return Splats(
-        means=x,
-        quats=quats[back],
-        scales=pitch[:, None] * np.array([0.6, 0.6, 0.05]),
-        opacities=np.full(len(x), 0.95),
-        sh=sh_from_colors(np.clip(shade, 0.0, 1.0)),
-        name=name,
-    )
+    sh = sh_from_colors(np.clip(shade, 0.0, 1.0)).astype(np.float32)
+    arrays = {
+        "means": x.astype(np.float32),
+        "quats": quats[back],
+        "scales": np.stack([(pitch * width).astype(np.float32) for width in (0.6, 0.6, 0.05)], axis=1),
+        "opacities": np.full(len(x), 0.95, np.float32),
+        "sh": np.broadcast_to(sh, (len(x), 1, 3)),
+    }
+    del x, places, tree, given, shade, pitch  # splats take as much again while they are checked
+    return Splats(**arrays, name=name)
 
 
 def _frames(normals: NDArray[np.float64]) -> NDArray[np.float64]:
