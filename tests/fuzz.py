@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import collections
+import copy
 import gzip
 import io
 import json
@@ -134,7 +135,7 @@ def damaged_json(data: bytes, random: Random, other: bytes = b"") -> bytes:
             source, name = places[random.integers(len(places))]
             owner[key] = json.loads(json.dumps(source[name]))
         else:
-            owner[key] = VALUES[random.integers(len(VALUES))]
+            owner[key] = copy.deepcopy(VALUES[random.integers(len(VALUES))])
     text = json.dumps(tree)
     depth = int(random.choice([60, 400, 900, 100_000]))
     text = text.replace(f'"{DEEP}"', "[" * depth + "]" * depth).replace(
@@ -180,7 +181,9 @@ def damaged_array(data: bytes, random: Random, other: bytes = b"") -> bytes:
         )
     elif kind == 6:
         with np.errstate(all="ignore"):
-            kinds = ["<f2", "<f4", "<f8", "<i4", "<u1", "<c8", "<U3", "<i8", "?"]
+            kinds = (
+                ["<f2", "<f4", "<f8", "<i4", "<u1", "<c8", "<U3", "<i8", "?"] if array.dtype.kind != "U" else ["<U1"]
+            )
             array = array.astype(kinds[random.integers(len(kinds))])
     else:
         array = np.zeros((0, 2**40) if random.random() < 0.5 else array.shape, array.dtype)
@@ -230,6 +233,20 @@ def damaged_gzip(data: bytes, random: Random, other: bytes = b"") -> bytes:
     return gzip.compress(damaged_bytes(gzip.decompress(data), random), mtime=0)
 
 
+def damaged_nanovdb(data: bytes, random: Random, other: bytes = b"") -> bytes:
+    """Return a NanoVDB file half of whose changes hit its headers; some are packed afterwards, so as to pass zlib."""
+    from tests.radiance.test_nanovdb import GRID, TREE, packed_again, start_of_grid
+
+    out, start = bytearray(data), start_of_grid(data)
+    for _ in range(int(random.integers(1, 9))):
+        at = int(random.integers(start + GRID + TREE + 128 if random.random() < 0.5 else len(out) - 8))
+        value = random.bytes(int(random.integers(1, 9)))
+        out[at : at + len(value)] = value
+    if start_of_grid(bytes(out)) == start and random.random() < 0.3:
+        out = bytearray(packed_again(bytes(out)))
+    return bytes(out[: int(random.integers(len(out)))] if random.random() < 0.2 else out)
+
+
 def damaged_header(data: bytes, random: Random, other: bytes = b"") -> bytes:
     """Return a .ply with a damaged header, or damaged bytes."""
     head, end, rest = data.partition(b"end_header\n")
@@ -238,7 +255,7 @@ def damaged_header(data: bytes, random: Random, other: bytes = b"") -> bytes:
 
 MUTATORS: dict[str, Callable[..., bytes]] = {
     "bytes": damaged_bytes, "text": damaged_text, "json": damaged_json, "zip": damaged_zip, "glb": damaged_glb,
-    "gzip": damaged_gzip, "ply": damaged_header,
+    "gzip": damaged_gzip, "ply": damaged_header, "nvdb": damaged_nanovdb,
 }  # fmt: skip
 
 
@@ -284,8 +301,7 @@ def run(
     with tempfile.TemporaryDirectory() as scratch:
         sound = Path(scratch) / "sound"
         sound.mkdir()
-        found = fuzz_seeds.seeds(Path(scratch))
-        found = {name: seed for name, seed in found.items() if formats is None or name in formats}
+        found = fuzz_seeds.seeds(Path(scratch), formats)
         for name, (suffix, _, contents) in found.items():
             for k, content in enumerate(contents):
                 (sound / f"{k}@{name}@{suffix}").write_bytes(content)

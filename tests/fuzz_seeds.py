@@ -9,7 +9,7 @@ import io
 import json
 import tempfile
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -146,10 +146,20 @@ def _robot(path: Path) -> None:
 
 
 def _stage(path: Path) -> None:
-    from softmode.usd import read_usd_scene
+    import newton
 
-    for body in read_usd_scene(path).deformables:
-        assert np.isfinite(body.translation).all() and np.isfinite(body.points).all()
+    from softmode.objects.stage_scene import open_scene
+    from softmode.usd.importer import _add_rest
+
+    with tempfile.TemporaryDirectory() as folder:
+        for body in open_scene(path, None, folder, copy=True).deformables:
+            assert np.isfinite(body.translation).all() and abs(np.linalg.det(body.rotation) - 1.0) < 1e-6
+            for surface in (*body.meshes, *([body.surface] if body.surface else [])):
+                assert np.isfinite(surface.vertices).all()
+                assert not surface.faces.size or 0 <= surface.faces.min() <= surface.faces.max() < len(surface.vertices)
+            assert np.isfinite(body.points).all()
+            body.material(1.0e-3)
+        _add_rest(newton.ModelBuilder(), f"{folder}/rest.usdc", path.name, {})
 
 
 def _animation(path: Path) -> None:
@@ -206,18 +216,36 @@ def _zipped(folder: Path) -> bytes:
     return stream.getvalue()
 
 
-def seeds(folder: Path) -> Seeds:
-    """Return sound files of every format whose packages are installed; files may be written into a folder."""
-    found = {**_splat_seeds(folder), **array_seeds(folder), **_mesh_seeds(folder), **_text_seeds(folder)}
-    if importlib.util.find_spec("pxr"):
-        found |= _stage_seeds(folder)
-    if importlib.util.find_spec("pyarrow"):
-        from tests.demonstrations import episodes
+def seeds(folder: Path, formats: Collection[str] | None = None) -> Seeds:
+    """Return sound files of some formats, or of all whose packages are installed.
 
-        for pictures in (None, "image"):
-            episodes.write(folder / f"dataset {pictures}", (4, 3), pictures)
-        found["dataset"] = ".zip", "zip", [_zipped(folder / f"dataset {pictures}") for pictures in (None, "image")]
-    return found
+    Args:
+        folder: Where files may be written.
+        formats: Names in `READERS`; all if None.
+    """
+    makers = {
+        _splat_seeds: ("ply", "compressed ply", "splat", "spz 3", "spz 4", "spz packed", "sog"),
+        array_seeds: ("points", "paint", "body", "morph", "recording", "state", "radiance", "nanovdb", "checkpoint"),
+        _mesh_seeds: ("mesh ply", "obj", "stl", "off", "glb", "gltf", "points ply", "xyz"),
+        _text_seeds: ("mjcf", "urdf", "options", "run"),
+    }
+    if importlib.util.find_spec("pxr"):
+        makers[_stage_seeds] = ("stage", "stage splats", "stage body", "animation")
+    if importlib.util.find_spec("pyarrow"):
+        makers[_dataset_seeds] = ("dataset",)
+    found: Seeds = {}
+    for make, names in makers.items():
+        if formats is None or set(formats) & set(names):
+            found |= make(folder)
+    return {name: seed for name, seed in found.items() if formats is None or name in formats}
+
+
+def _dataset_seeds(folder: Path) -> Seeds:
+    from tests.demonstrations import episodes
+
+    for pictures in (None, "image"):
+        episodes.write(folder / f"dataset {pictures}", (4, 3), pictures)
+    return {"dataset": (".zip", "zip", [_zipped(folder / f"dataset {pictures}") for pictures in (None, "image")])}
 
 
 def _splat_seeds(folder: Path) -> Seeds:
@@ -256,6 +284,7 @@ def array_seeds(folder: Path) -> Seeds:
     from softmode.view.live_recording import LiveRecording
     from tests.bodies import cube
     from tests.radiance.test_grid import plenoxels, small
+    from tests.radiance.test_nanovdb import with_checksums
     from tests.splats.test_splats import random_splats
 
     random = np.random.default_rng(0)
@@ -285,8 +314,7 @@ def array_seeds(folder: Path) -> Seeds:
     values = np.zeros((8, 8, 8), np.float32)
     values[2:6, 3:6, 1:7] = 40.0
     volume = wp.Volume.load_from_numpy(values, min_world=(1.0, 2.0, 3.0), voxel_size=0.5, bg_value=0.0, device="cpu")
-    for codec in ("none", "zip"):
-        volume.save_to_nvdb(str(folder / codec), codec=codec)
+    volume.save_to_nvdb(str(folder / "none"), codec="none")
     plain = {
         "density": small()["density"],
         "bounds": np.array([[0.0] * 3, [1.0] * 3]),
@@ -304,7 +332,7 @@ def array_seeds(folder: Path) -> Seeds:
         "recording": (".npz", "zip", [(folder / "recording.npz").read_bytes()]),
         "state": (".npz", "zip", [(folder / "state.npz").read_bytes()]),
         "radiance": (".npz", "zip", [_npz(True, **small()), _npz(**plenoxels()), _npz(**plain)]),
-        "nanovdb": (".nvdb", "bytes", [(folder / codec).read_bytes() for codec in ("none", "zip")]),
+        "nanovdb": (".nvdb", "nvdb", [(folder / "none").read_bytes(), with_checksums((folder / "none").read_bytes())]),
     }
     if importlib.util.find_spec("torch"):
         from softmode.learning.checkpoints import write_checkpoint

@@ -85,7 +85,7 @@ def bombs() -> dict[str, tuple[bytes, str]]:
         "radiance@ of links.npz": (
             packed(
                 links=npy(np.full((220, 220, 220), -1, "<i4")), density_data=npy(np.ones((1, 1))),
-                sh_data=npy(np.ones((1, 27))), radius=npy(np.ones(3)), center=npy(np.zeros(3)),
+                sh_data=npy(np.ones((1, 12))), radius=npy(np.ones(3)), center=npy(np.zeros(3)),
             ),
             "fill a grid",
         ),
