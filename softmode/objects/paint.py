@@ -17,7 +17,7 @@ from scipy.spatial import KDTree
 
 from softmode.checks import require_number
 from softmode.errors import AssetError, ConfigError, MaterialError
-from softmode.files import damage_errors, read_arrays
+from softmode.files import UNPACKED_FREE, damage_errors, read_arrays
 from softmode.objects.primitives import Color
 from softmode.splats.point_cloud import distinct
 from softmode.splats.splats import Splats
@@ -83,11 +83,13 @@ def nearest_field(points: ArrayLike, values: ArrayLike) -> Field:
     """
     x, factors = np.asarray(points, dtype=np.float64), np.asarray(values, dtype=np.float64)
     if x.ndim != 2 or x.shape[1] != 3 or factors.shape != (len(x),) or not len(x) or not np.isfinite(x).all():
-        raise MaterialError(f"field: expected points (N > 0, 3) and values (N,), got {x.shape} and {factors.shape}")
+        what = f"field: expected finite points (N > 0, 3) and values (N,), got {x.shape} and {factors.shape}"
+        raise MaterialError(what, hint="give one factor for each point")
     bad = np.flatnonzero(~((factors >= FACTORS[0]) & (factors <= FACTORS[1])))
     if len(bad):
         raise MaterialError(
-            f"field: factors must lie in {FACTORS[0]:g}..{FACTORS[1]:g}, got {factors[bad[0]]} at row {bad[0]}"
+            f"field: factors must lie in {FACTORS[0]:g}..{FACTORS[1]:g}, got {factors[bad[0]]} at row {bad[0]}",
+            hint="a factor is that of the material there over that of the body",
         )
     first, _ = distinct(x)
     tree, factors = KDTree(x[first]), factors[first]
@@ -127,7 +129,7 @@ def read_field(path: str | os.PathLike[str]) -> Field:
         MaterialError: If a factor lies outside 0.001..1000.
     """
     hint = "give an .npz with points (N, 3) and factors (N,)"
-    arrays = read_arrays(path, ("points", "factors"), what="field", hint=hint)
+    arrays = read_arrays(path, ("points", "factors"), what="field", hint=hint, free=UNPACKED_FREE // 2)
     if arrays.keys() < {"points", "factors"}:
         raise AssetError(f"field {path}: holds {sorted(arrays)}", hint=hint)
     with damage_errors(f"field {path}", hint=hint):

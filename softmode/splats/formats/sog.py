@@ -215,7 +215,8 @@ def _decode(source: str, read: _Reader) -> Splats:
     color = pixels(meta["sh0"]["files"].files(1)[0])
     sh = meta["sh0"]["codebook"].numbers(256)[color[:, :3]][:, None]
     if "shN" in meta:
-        sh = np.concatenate([sh, _decode_palette(meta["shN"], pixels, image)], axis=1)
+        with np.errstate(over="ignore"):
+            sh = np.concatenate([sh.astype(np.float32), _decode_palette(meta["shN"], pixels, image)], axis=1)
     return Splats(
         means=means,
         quats=wxyz[:, [1, 2, 3, 0]],
@@ -228,7 +229,7 @@ def _decode(source: str, read: _Reader) -> Splats:
 
 def _decode_palette(
     meta: _SogMeta, pixels: Callable[[str], NDArray[np.uint8]], image: Callable[..., NDArray[np.uint8]]
-) -> NDArray[np.float64]:
+) -> NDArray[np.float32]:
     """Decode the higher spherical harmonics: one of up to 65536 palette entries per splat, 64 entries per image row."""
     coefficient_count = (meta["bands"].integer(1, 3) + 1) ** 2 - 1
     centroid_file, label_file = meta["files"].files(2)
@@ -238,4 +239,5 @@ def _decode_palette(
     if entry.max() >= 64 * len(palette):
         raise meta.fail(f"a splat names palette entry {entry.max()}, the palette holds {64 * len(palette)}")
     column = (entry % 64)[:, None] * coefficient_count + np.arange(coefficient_count)
-    return meta["codebook"].numbers(256)[palette[(entry // 64)[:, None], column][..., :3]]
+    codebook = meta["codebook"].numbers(256).astype(np.float32)
+    return codebook[palette[(entry // 64)[:, None], column][..., :3]]

@@ -196,7 +196,8 @@ def _decode(header: _Header, arrays: dict[str, Any], path: str) -> Splats:
     sh = ((table("colors", 3) / 255.0 - 0.5) / _DC_SCALE)[:, None]
     if header.degree:
         rest = table("sh", 3 * ((header.degree + 1) ** 2 - 1)).reshape(header.count, -1, 3)
-        sh = np.concatenate([sh, (rest[:, :15].astype(np.float64) - 128.0) / 128.0], axis=1)
+        steps = np.arange(-128.0, 128.0, dtype=np.float32) / np.float32(128.0)
+        sh = np.concatenate([sh.astype(np.float32), steps[rest[:, :15]]], axis=1)
     return Splats(
         means=means,
         quats=quats,
