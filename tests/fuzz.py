@@ -328,7 +328,8 @@ def run(
                     tally.loaded += not outcome.error
                     tally.refused += bool(outcome.error)
                     tally.seconds += outcome.seconds
-                    if outcome.error == "killed" or not outcome.typed or not outcome.within(size, 2.0 + size / 5e5):
+                    plain = outcome.error in ("ConfigError", "MaterialError")  # their message says what was expected
+                    if not (outcome.typed or plain) or not outcome.within(size, 2.0 + size / 5e5):
                         tally.findings += 1
                         findings.append(
                             f"{path.name}: {outcome.error} {outcome.message[:300]!r}, {size} bytes, "

@@ -401,7 +401,11 @@ def _text_seeds(folder: Path) -> Seeds:
     return {
         "mjcf": (".xml", "text", mjcf),
         "urdf": (".urdf", "text", [urdf.encode()]),
-        "options": (".json", "json", [_OPTIONS.encode(), json.dumps({"size": 0.1, "preset": "donut"}).encode()]),
+        "options": (
+            ".json",
+            "json",
+            [_OPTIONS.encode(), json.dumps({"config": {"yaw_range": 1.0, "density_range": [200.0, 300.0]}}).encode()],
+        ),
         "run": (".zip", "zip", [_zipped(run)]),
     }
 

@@ -65,10 +65,10 @@ def overlapping(names: list[str], content: bytes) -> bytes:
 
 def bombs() -> dict[str, tuple[bytes, str]]:
     """Return small files that would become large, and what their refusal says, by format and name."""
-    zeros, many = np.zeros(160 << 20, np.uint8), [f"a{k:04}" for k in range(1200)]
+    zeros, many = np.zeros(96 << 20, np.uint8), [f"a{k:04}" for k in range(1200)]
     header = npy(np.frombuffer(json.dumps({"format": "softmode.Checkpoint", "version": 1}).encode(), np.uint8))
-    points = npy(zeros[: 120 << 20].view("<f4").reshape(-1, 3))
-    line = np.repeat(np.arange(1_000_000, dtype="<f4")[:, None], 3, axis=1)
+    points = npy(zeros.view("<f4").reshape(-1, 3))
+    line = np.repeat(np.arange(300_000, dtype="<f4")[:, None], 3, axis=1)
     empty = npy(np.zeros(0), shape=(2**40, 0))
     table = packed(points=b"")[:-22] + struct.pack("<4sHHHHIIH", b"PK\5\6", 0, 0, 9, 9, 5 << 20, 0, 0)
     return {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import types
 import typing
 from collections.abc import Mapping
 from pathlib import Path
@@ -153,6 +154,14 @@ def _required(cls: type) -> bool:
 def _field_of(value: Any, hint: Any, before: Any) -> Any:
     """Return the value of a field: dicts as configurations, lists as tuples."""
     arguments = typing.get_args(hint)
+    union = typing.get_origin(hint) in (typing.Union, types.UnionType)
+    kinds = [typing.get_origin(kind) or kind for kind in (arguments if union else (hint,))]
+    if value is not None or type(None) not in kinds:
+        kinds = [kind for kind in kinds if kind is not type(None)]
+        if all(dataclasses.is_dataclass(kind) for kind in kinds) and not isinstance(value, (dict, *kinds)):
+            raise ConfigError(f"{value!r} is no {kinds[0].__name__}", hint="give its fields by name")
+        if all(kind is tuple for kind in kinds) and not isinstance(value, list | tuple):
+            raise ConfigError(f"{value!r} is no list", hint="give one value after the other")
     if isinstance(value, dict) and isinstance(before, Mapping):
         unknown = sorted(set(value) - set(before))
         if unknown:

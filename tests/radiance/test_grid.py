@@ -187,7 +187,7 @@ def test_headers_that_promise_too_much(tmp_path):
     )
     with zipfile.ZipFile(tmp_path / "bomb.npz", "w") as archive:
         archive.writestr("density.npy", header.getvalue())
-    with pytest.raises(AssetError, match="bytes, at most"):
+    with pytest.raises(AssetError, match="another size"):
         read_radiance(tmp_path / "bomb.npz")
 
 
