@@ -17,7 +17,7 @@ import numpy as np
 
 Seeds = dict[str, tuple[str, str, list[bytes]]]
 """Suffix, mutator and contents by format."""
-DEAR = ("stage", "stage splats", "stage body", "animation", "dataset")
+DEAR = ("stage", "stage packed", "stage splats", "stage body", "animation", "dataset")
 """Formats of which fewer are tried, since each takes a process or many files."""
 
 
@@ -193,6 +193,7 @@ READERS: dict[str, Callable[[Path], Any]] = {
     "options": _config,
     "run": _run,
     "stage": _stage,
+    "stage packed": _stage,
     "animation": _animation,
     "dataset": _dataset,
 }
@@ -230,7 +231,7 @@ def seeds(folder: Path, formats: Collection[str] | None = None) -> Seeds:
         _text_seeds: ("mjcf", "urdf", "options", "run"),
     }
     if importlib.util.find_spec("pxr"):
-        makers[_stage_seeds] = ("stage", "stage splats", "stage body", "animation")
+        makers[_stage_seeds] = ("stage", "stage packed", "stage splats", "stage body", "animation")
     if importlib.util.find_spec("pyarrow"):
         makers[_dataset_seeds] = ("dataset",)
     found: Seeds = {}
@@ -447,6 +448,7 @@ def _stage_seeds(folder: Path) -> Seeds:
     return {
         "stage body": (".usd", "text", [(folder / f"body{suffix}").read_bytes() for suffix in (".usda", ".usdc")]),
         "animation": (".usd", "text", [(folder / f"animation{suffix}").read_bytes() for suffix in (".usda", ".usdc")]),
-        "stage": (".usd", "text", [*texts, *crates, (folder / "Mesh.usdz").read_bytes()]),
+        "stage": (".usd", "text", [*texts, *crates]),
+        "stage packed": (".usdz", "bytes", [(folder / "Mesh.usdz").read_bytes()]),
         "stage splats": (".usd", "text", [(folder / f"splats{suffix}").read_bytes() for suffix in (".usda", ".usdc")]),
     }
