@@ -203,7 +203,7 @@ def open_file(
     *,
     hint: str = "check the path",
     error: type[SoftmodeError] = AssetError,
-) -> BinaryIO:
+) -> io.BufferedReader:
     """Open a regular file for reading; a folder, pipe, socket or device is refused, never waited for.
 
     Args:
