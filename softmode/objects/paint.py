@@ -83,7 +83,7 @@ def nearest_field(points: ArrayLike, values: ArrayLike) -> Field:
     """
     x, factors = np.asarray(points, dtype=np.float64), np.asarray(values, dtype=np.float64)
     if x.ndim != 2 or x.shape[1] != 3 or factors.shape != (len(x),) or not len(x) or not np.isfinite(x).all():
-        what = f"field: expected finite points (N > 0, 3) and values (N,), got {x.shape} and {factors.shape}"
+        what = f"field: expected points (N > 0, 3), finite, and values (N,), got {x.shape} and {factors.shape}"
         raise MaterialError(what, hint="give one factor for each point")
     bad = np.flatnonzero(~((factors >= FACTORS[0]) & (factors <= FACTORS[1])))
     if len(bad):
