@@ -267,30 +267,6 @@ def read_json(
         return json.loads(content)
 
 
-def resolve_within(
-    root: Path, name: str, what: str = "file", *, base: Path | None = None, error: type[SoftmodeError] = AssetError
-) -> Path:
-    """Return the path that an asset means by the name of another file; it need not exist.
-
-    Args:
-        root: The folder that nothing may lead out of, be it by `..`, an absolute path or a symbolic link.
-        name: The reference.
-        what: Who refers to it, for messages.
-        base: Where the reference starts; the root if None.
-        error: What is raised.
-
-    Raises:
-        AssetError: Or ``error``, if it is a URL or leads out of the root.
-    """
-    hint = "put the files themselves, not links to them, into the folder of the asset"
-    with damage_errors(f"{what}: reference {name!r}", hint=hint, error=error):
-        found = ((base or root) / name).resolve()
-        inside = found.is_relative_to(root.resolve())
-    if not inside or "://" in name:
-        raise error(f"{what}: refers to {name!r}, which lies outside of {root}", hint=hint)
-    return found
-
-
 def require_content(path: Path, what: str) -> None:
     """Raise if a file holds nothing, is no regular file, or is a .ply by its name alone.
 

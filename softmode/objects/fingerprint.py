@@ -8,7 +8,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from softmode.files import damage_errors, open_file, read_json, resolve_within
+from softmode.errors import AssetError
+from softmode.files import damage_errors, open_file, read_json
+from softmode.foreign.child.layers import inside
 
 _INDEX = (".json", ".gltf")
 """Suffixes of files that name others beside them: SOG v2, glTF."""
@@ -46,7 +48,10 @@ def _fingerprint(file: Path, changed: int, size: int) -> str:
     if file.suffix.lower() in _INDEX:
         named = {name for name in _strings(read_json(file, "object file")) if Path(name).name == name}
         for name in sorted(named):
-            if name and (beside := resolve_within(file.parent, name, f"object file {file}")).is_file():
+            beside = file.parent / name
+            if name and not inside(str(beside), str(file.parent)):
+                raise AssetError(f"object file {file}: {name} leads outside of its folder", hint="copy it there")
+            if name and beside.is_file():
                 with open_file(beside, "object file") as stream:
                     digest.update(stream.read())
     return digest.hexdigest()

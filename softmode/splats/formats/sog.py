@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from softmode.errors import AssetError
-from softmode.files import open_file, open_zip, read_file, resolve_within
+from softmode.files import open_file, open_zip, read_file
+from softmode.foreign.child.layers import inside
 from softmode.splats.formats.common import FREE_BYTES, MAX_RATIO, exp_scales, quats_from_smallest_three, unreadable
 from softmode.splats.splats import MAX_SPLATS, Splats
 
@@ -71,7 +72,9 @@ def _folder_reader(folder: Path, meta: str = "meta.json") -> _Reader:
     def read(name: str, limit: int) -> bytes:
         if name == "meta.json":  # the file that was named, wherever it lies
             return read_file(folder / meta, "splat file", limit=limit)
-        file = resolve_within(folder, name, f"splat file {folder / meta}")
+        file = folder / name
+        if not inside(str(file), str(folder)):
+            raise unreadable(folder / meta, f"member {name} is a link that leads outside of its folder", hint=_WHOLE)
         return read_file(file, f"splat file {folder / meta}: member", limit=limit, hint=_WHOLE)
 
     return read
