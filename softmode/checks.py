@@ -43,7 +43,7 @@ def require_number(
     """
     try:
         number = math.nan if isinstance(value, str | bytes) else float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         number = math.nan
     limits = (
         (above, " > ", number > (above if above is not None else -math.inf)),
@@ -61,7 +61,16 @@ def require_number(
     else:
         bounds = " and".join(f"{sign}{_written(limit)}" for limit, sign, _ in limits if limit is not None)
         wanted = f"be a finite number{bounds}{unit}"
-    raise error(f"{name} must {wanted}, got {value!r}", hint=hint)
+    raise error(f"{name} must {wanted}, got {_shown(value)}", hint=hint)
+
+
+def _shown(value: Any) -> str:
+    """Return a value as messages show it, cut where it is long."""
+    try:
+        text = repr(value)
+    except ValueError:  # a whole number of more than 4,300 digits
+        return "a number of too many digits"
+    return text if len(text) <= 200 else text[:200] + "..."
 
 
 def _written(limit: float) -> str:
@@ -104,8 +113,8 @@ def require_numbers(name: str, values: Sequence[float], count: int, **limits: An
     Raises:
         ConfigError: If it does not.
     """
-    if len(values) != count:
-        raise ConfigError(f"{name} must hold {count} numbers, got {values!r}", hint=limits.get("hint", ""))
+    if not hasattr(values, "__len__") or isinstance(values, str | bytes | dict | set) or len(values) != count:
+        raise ConfigError(f"{name} must hold {count} numbers, got {_shown(values)}", hint=limits.get("hint", ""))
     for index, value in enumerate(values):
         require_number(f"{name}[{index}]", value, **limits)
 
@@ -137,5 +146,5 @@ def require_choice(name: str, value: object, choices: Collection[object]) -> Non
     Raises:
         ConfigError: If it is none of them.
     """
-    if value not in choices:
-        raise ConfigError(f"{name} is {value!r}", hint=f"use one of {', '.join(map(repr, choices))}")
+    if value not in list(choices):
+        raise ConfigError(f"{name} is {_shown(value)}", hint=f"use one of {', '.join(map(repr, choices))}")

@@ -16,9 +16,11 @@ class SoftmodeError(Exception):
 
     def __init__(self, message: str, *, hint: str = "") -> None:
         """Store the message and the remedy."""
-        super().__init__(message)
-        self.message = message
-        self.hint = hint
+        # What a file or a name brought in is shown, not obeyed by a terminal, and can be printed in any encoding.
+        self.message, self.hint = (
+            "".join(c if c.isprintable() or c == "\n" else ascii(c)[1:-1] for c in text) for text in (message, hint)
+        )
+        super().__init__(self.message)
 
     def __str__(self) -> str:
         """Return the message followed by the remedy."""

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, archives of arrays, and one error for what cannot be written."""
+"""Files that appear whole or not at all, files of strangers read within bounds, and archives of arrays."""
 
 from __future__ import annotations
 
@@ -7,21 +7,28 @@ import io
 import json
 import math
 import os
+import stat
 import zipfile
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import IO, Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.errors import AssetError, SoftmodeError, StorageError, memory_errors
+from softmode.errors import AssetError, BasisError, ConfigError, SoftmodeError, StorageError, memory_errors
 from softmode.leftovers import Claim
 
 PLACE_HINT = "check the folder, its permissions and the free space"
 """The remedy for a file that cannot be written."""
 MAX_HEADER = 1 << 20
-"""Largest header of an archive that is read [bytes]."""
+"""Largest header, and largest table of contents, of an archive that is read [bytes]."""
+MAX_JSON = 16 << 20
+"""Largest JSON file that is read [bytes]; the values that it becomes may take 24 times as much."""
+UNPACKED_FREE, UNPACKED_RATIO = 64 << 20, 2
+"""Bytes that the arrays of an archive may unpack to: so many, or so many for each byte of the file."""
+_PACKED_FREE = 32 << 20
+_CHUNK = 1 << 22
 
 
 @contextlib.contextmanager
@@ -162,32 +169,12 @@ def whole_file(path: str | os.PathLike[str], what: str = "file", *, make_folders
         yield file
 
 
-# -- archives ---------------------------------------------------------------------------------------------------------
-
-
-def require_content(path: Path, name: str) -> None:
-    """Raise if a file holds nothing, or is a .ply by its name alone.
-
-    Args:
-        path: A file that exists.
-        name: What messages call it.
-
-    Raises:
-        AssetError: If it is empty or mislabelled.
-    """
-    with path.open("rb") as file:
-        head = file.read(80)
-    if not head:
-        raise AssetError(f"{name}: the file is empty", hint="Copy or export it again")
-    if path.suffix.lower() == ".ply" and not head.startswith(b"ply"):
-        raise AssetError(
-            f"{name}: no .ply, it does not begin with 'ply'", hint="Name the file after its kind (.obj, .stl, ...)"
-        )
+# -- files of strangers -----------------------------------------------------------------------------------------------
 
 
 @contextlib.contextmanager
 def damage_errors(what: str, *, hint: str, error: type[SoftmodeError] = AssetError) -> Iterator[None]:
-    """Turn whatever reading an .npz in a block raises into one typed error.
+    """Turn whatever reading a file in a block raises into one typed error; typed errors pass, but those of arguments.
 
     Args:
         what: The file, for the message.
@@ -195,14 +182,141 @@ def damage_errors(what: str, *, hint: str, error: type[SoftmodeError] = AssetErr
         error: What is raised.
 
     Raises:
-        AssetError: Or ``error``, if the block raises anything.
+        AssetError: Or ``error``, if the block raises anything that is not typed.
     """
     try:
         yield
+    except (ConfigError, BasisError) as caught:  # what the file said was no good argument
+        if isinstance(caught, error):
+            raise
+        raise error(f"{what}: {caught.message}", hint=caught.hint or hint) from caught
+    except SoftmodeError:
+        raise
     except FileNotFoundError as caught:
         raise error(f"{what}: does not exist", hint=hint) from caught
-    except Exception as caught:  # zlib, struct and zipfile errors of a damaged archive have no common base
-        raise error(f"{what}: damaged or no .npz ({type(caught).__name__}: {caught})", hint=hint) from caught
+    except MemoryError as caught:
+        raise error(f"{what}: takes more memory than there is ({caught})", hint=hint) from caught
+    except Exception as caught:  # zlib, struct and zipfile errors of a damaged file have no common base
+        if isinstance(caught, OSError) and caught.strerror:
+            raise error(f"{what}: cannot be read ({caught.strerror})", hint=hint) from caught
+        raise error(f"{what}: damaged or no such thing ({type(caught).__name__}: {caught})", hint=hint) from caught
+
+
+def open_file(
+    path: str | os.PathLike[str],
+    what: str = "file",
+    *,
+    hint: str = "check the path",
+    error: type[SoftmodeError] = AssetError,
+) -> io.BufferedReader:
+    """Open a regular file for reading; a folder, pipe, socket or device is refused, never waited for.
+
+    Args:
+        path: The file.
+        what: What it is, for messages.
+        hint: The remedy if it cannot be opened.
+        error: What is raised then.
+
+    Raises:
+        AssetError: Or ``error``, if there is no such file, or no file may have such a name.
+    """
+    with damage_errors(f"{what} {path}", hint=hint, error=error):
+        file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | getattr(os, "O_NONBLOCK", 0)))
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        file.close()
+        raise error(f"{what} {path}: is no regular file", hint=hint)
+    return file
+
+
+def read_file(
+    path: str | os.PathLike[str],
+    what: str = "file",
+    *,
+    limit: int | None = None,
+    hint: str = "check the path",
+    error: type[SoftmodeError] = AssetError,
+) -> bytes:
+    """Return the content of a regular file.
+
+    Args:
+        path: The file.
+        what: What it is, for messages.
+        limit: Most bytes that are read; None for any number.
+        hint: The remedy if it cannot be read.
+        error: What is raised then.
+
+    Raises:
+        AssetError: Or ``error``, if it cannot be read or is larger.
+    """
+    with open_file(path, what, hint=hint, error=error) as file:
+        size = os.fstat(file.fileno()).st_size
+        if limit is not None and size > limit:
+            raise error(f"{what} {path}: has {size} bytes, at most {limit} are read", hint=hint)
+        with damage_errors(f"{what} {path}", hint=hint, error=error):
+            try:
+                return file.read(size)
+            except MemoryError as caught:
+                raise MemoryError(f"{size} bytes") from caught
+
+
+def read_json(
+    path: str | os.PathLike[str],
+    what: str = "file",
+    *,
+    hint: str = "check the path",
+    error: type[SoftmodeError] = AssetError,
+) -> Any:
+    """Return the value in a JSON file of at most 16 MiB; arguments and errors are those of :func:`read_file`."""
+    content = read_file(path, what, limit=MAX_JSON, hint=hint, error=error)
+    with damage_errors(f"{what} {path}", hint=hint, error=error):
+        return json.loads(content)
+
+
+def require_content(path: Path, what: str) -> None:
+    """Raise if a file holds nothing, is no regular file, or is a .ply by its name alone.
+
+    Args:
+        path: The file.
+        what: What it is, for messages.
+
+    Raises:
+        AssetError: If it is empty or mislabelled, or cannot be opened.
+    """
+    with open_file(path, what) as file:
+        head = file.read(80)
+    if not head:
+        raise AssetError(f"{what} {path}: the file is empty", hint="Copy or export it again")
+    if path.suffix.lower() == ".ply" and not head.startswith(b"ply"):
+        raise AssetError(
+            f"{what} {path}: no .ply, it does not begin with 'ply'",
+            hint="Name the file after its kind (.obj, .stl, ...)",
+        )
+
+
+# -- archives ---------------------------------------------------------------------------------------------------------
+
+
+def open_zip(stream: BinaryIO) -> zipfile.ZipFile:
+    """Return a zip archive whose table of contents is small and whose members lie side by side, not over each other.
+
+    Raises:
+        ValueError: If they do not; zipfile's own errors if it is no archive.
+    """
+    size = stream.seek(0, os.SEEK_END)
+    stream.seek(max(0, size - (1 << 16) - 22))
+    tail = stream.read()
+    tables = [0]
+    for at in (len(tail) - 22, tail.rfind(b"PK\5\6")):  # where zipfile looks for the end of the table
+        if tail[at : at + 4] == b"PK\5\6":
+            tables.append(int.from_bytes(tail[at + 12 : at + 16], "little"))
+            if tail[at - 20 : at - 16] == b"PK\6\7":  # zip64, which stands before it
+                tables[-1] = int.from_bytes(tail[at - 36 : at - 28], "little")
+    if max(tables) > MAX_HEADER:
+        raise ValueError(f"its table of contents has {max(tables)} bytes, at most {MAX_HEADER}")
+    archive = zipfile.ZipFile(stream)
+    if (packed := sum(member.compress_size for member in archive.infolist())) > size:
+        raise ValueError(f"its members overlap: {packed} bytes in a file of {size}")
+    return archive
 
 
 def write_archive(
@@ -258,9 +372,10 @@ def read_archive(
     Raises:
         AssetError: Or ``error``, if the file is missing, damaged, of another kind or of another version.
     """
-    source, path = (io.BytesIO(path), "of bytes") if isinstance(path, bytes) else (Path(path), path)
-    with damage_errors(f"{what} {path}", hint=hint, error=error):
-        arrays = _stored_arrays(source)
+    source = io.BytesIO(path) if isinstance(path, bytes) else open_file(path, what, hint=hint, error=error)
+    path = "of bytes" if isinstance(path, bytes) else path
+    with source, damage_errors(f"{what} {path}", hint=hint, error=error):
+        arrays = _arrays(source, None, stored=True)
         header = json.loads(arrays.pop("header").tobytes()) if "header" in arrays else None
     if not isinstance(header, dict) or header.pop("format", None) != kind:
         raise error(f"{what} {path}: not a {kind}", hint=hint)
@@ -279,6 +394,7 @@ def read_arrays(
     what: str = "file",
     hint: str = "write it again",
     error: type[SoftmodeError] = AssetError,
+    free: int = UNPACKED_FREE,
 ) -> dict[str, NDArray[Any]]:
     """Read arrays of an .npz that anybody may have written; no code in it is run.
 
@@ -288,39 +404,98 @@ def read_arrays(
         what: What it is, for messages.
         hint: The remedy if it cannot be read.
         error: What is raised then.
+        free: Bytes that they may unpack to however small the file is; a reader that makes much of them takes few.
 
     Raises:
         AssetError: Or ``error``, if the file is missing, damaged or no .npz.
     """
-    with damage_errors(f"{what} {path}", hint=hint, error=error), np.load(path, allow_pickle=False) as file:
-        return {name: file[name] for name in file.files if names is None or name in names}
+    with open_file(path, what, hint=hint, error=error) as file, damage_errors(f"{what} {path}", hint=hint, error=error):
+        return _arrays(file, names, free)
 
 
-def _stored_arrays(source: Path | io.BytesIO) -> dict[str, NDArray[Any]]:
-    """Return the arrays of an uncompressed .npz."""
+def array_names(path: str | os.PathLike[str], what: str = "file", *, hint: str = "write it again") -> set[str]:
+    """Return the names of the arrays of an .npz, of which none is read.
+
+    Raises:
+        AssetError: If the file is missing, damaged or no .npz.
+    """
+    with open_file(path, what, hint=hint) as file, damage_errors(f"{what} {path}", hint=hint):
+        return {name.removesuffix(".npy") for name in open_zip(file).namelist()}
+
+
+def write_compressed(path: str | os.PathLike[str], arrays: Mapping[str, NDArray[Any]], what: str = "archive") -> None:
+    """Write arrays as one .npz, packed if :func:`read_arrays` would unpack it; the file appears whole or not at all.
+
+    Args:
+        path: The file.
+        arrays: Numbers and texts by name.
+        what: What it is, for messages.
+
+    Raises:
+        StorageError: If it cannot be written.
+    """
+    with whole_file(path, what) as file:
+        np.savez_compressed(file, allow_pickle=False, **arrays)
+        if sum(array.nbytes for array in arrays.values()) + MAX_HEADER > max(
+            _PACKED_FREE, UNPACKED_RATIO * file.tell()
+        ):
+            file.seek(0)
+            np.savez(file, allow_pickle=False, **arrays)
+            file.truncate()
+
+
+def _arrays(
+    stream: BinaryIO, names: Collection[str] | None, free: int = UNPACKED_FREE, *, stored: bool = False
+) -> dict[str, NDArray[Any]]:
+    """Return arrays of an .npz; what they take is known and bounded before any of them is read.
+
+    Args:
+        stream: The file.
+        names: Which, as far as they are there; all if None.
+        free: Bytes that they may unpack to however small the file is.
+        stored: Whether it is an archive of :func:`write_archive`: nothing is packed, and all are plain numbers.
+
+    Raises:
+        ValueError: If it is anything else; and what zipfile and zlib raise.
+    """
     arrays: dict[str, NDArray[Any]] = {}
-    with zipfile.ZipFile(source) as archive:
-        for member in archive.infolist():
-            name = member.filename.removesuffix(".npy")
-            if member.compress_type != zipfile.ZIP_STORED or member.file_size != member.compress_size:
-                raise ValueError(f"{name} is compressed")
+    with open_zip(stream) as archive:
+        room = max(free, UNPACKED_RATIO * stream.seek(0, os.SEEK_END))
+        members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
+        if len(members) < len(archive.infolist()):
+            raise ValueError("a name is there twice")
+        members = {name: member for name, member in members.items() if names is None or name in names}
+        if (unpacked := sum(member.file_size for member in members.values())) > room:
+            raise ValueError(f"it unpacks to {unpacked} bytes, at most {room} do; numpy.savez does not pack")
+        for name, member in members.items():
+            if member.compress_type not in (zipfile.ZIP_STORED, *(() if stored else (zipfile.ZIP_DEFLATED,))):
+                raise ValueError(f"{name} is packed by method {member.compress_type}")
             if name == "header" and member.file_size > MAX_HEADER:
                 raise ValueError("the header is too large")
-            if name in arrays:
-                raise ValueError(f"{name} is there twice")
-            arrays[name] = _parsed_array(archive.read(member), name)
+            with archive.open(member) as content:
+                arrays[name] = _array(content, member.file_size, name, "fiu" if stored else "fiubU")
     return arrays
 
 
-def _parsed_array(content: bytes, name: str) -> NDArray[Any]:
-    """Return the array in the bytes of a .npy file of numbers, in the order that it was written in."""
-    stream = io.BytesIO(content)
-    if np.lib.format.read_magic(stream) != (1, 0):
+def _array(content: IO[bytes], size: int, name: str, kinds: str) -> NDArray[Any]:
+    """Return the array in a .npy file of so many bytes, in the order that it was written in."""
+    version = np.lib.format.read_magic(content)
+    if version not in ((1, 0), (2, 0)):
         raise ValueError(f"{name} has another version of the .npy format")
-    shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream)
-    if dtype.kind not in "fiu" or dtype.hasobject:
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, fortran, dtype = read(content)
+    if dtype.kind not in kinds or not dtype.itemsize:
         raise ValueError(f"{name} holds no plain numbers")
-    if any(size < 0 for size in shape) or math.prod(shape) * dtype.itemsize != len(content) - stream.tell():
+    count = math.prod(shape)
+    if any(n < 0 for n in shape) or count * dtype.itemsize != size - content.tell():
         raise ValueError(f"{name} has another size than its shape says")
-    flat = np.frombuffer(content, dtype, offset=stream.tell()).copy()
+    if math.prod(max(n, 1) for n in shape) > max(size, UNPACKED_FREE):  # what is empty may be long all the same
+        raise ValueError(f"{name} has the shape {shape}")
+    flat = np.empty(count, dtype)
+    octets = flat.view(np.uint8)
+    for at in range(0, len(octets), _CHUNK):
+        part = content.read(min(_CHUNK, len(octets) - at))
+        octets[at : at + len(part)] = np.frombuffer(part, np.uint8)
+        if len(part) < min(_CHUNK, len(octets) - at):
+            raise EOFError(f"{name} ends too soon")
     return flat.reshape(shape[::-1]).T if fortran else flat.reshape(shape)

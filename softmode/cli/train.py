@@ -185,7 +185,7 @@ def parse_env_options(text: str, obs_type: str | None = None) -> dict[str, Any]:
     """
     try:
         options = json.loads(text)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ConfigError(f"env-options is no JSON ({error})", hint='write it like {"obs_type": "state"}') from error
     if not isinstance(options, dict):
         raise ConfigError("env-options is no JSON object", hint='write it like {"obs_type": "state"}')
@@ -205,6 +205,6 @@ def parse_overrides(pairs: tuple[str, ...]) -> dict[str, Any]:
             raise ConfigError(f"{pair!r} is no NAME=VALUE", hint="write it like discount=0.97")
         try:
             overrides[name.replace("-", "_")] = json.loads(text)
-        except ValueError:
+        except (ValueError, RecursionError):
             overrides[name.replace("-", "_")] = text
     return overrides

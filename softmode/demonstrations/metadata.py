@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from softmode import files
 from softmode.demonstrations import schema
 from softmode.demonstrations.schema import INDEX_FEATURES, Feature
 from softmode.demonstrations.statistics import QUANTILES, Statistics, combine
@@ -18,7 +18,6 @@ from softmode.errors import AssetError, ConfigError
 from softmode.foreign import process
 from softmode.foreign.child.layers import inside
 
-LARGEST_JSON = 64 << 20
 REMEDY = "restore the folder from a copy, or record it again"
 
 
@@ -64,16 +63,7 @@ def file_of(row: Mapping[str, Any], kind: str) -> dict[str, int]:
 
 def read_json(path: Path) -> dict[str, Any]:
     """Return the object in a JSON file; raises AssetError if there is none."""
-    try:
-        if path.stat().st_size > LARGEST_JSON:
-            raise AssetError(f"{path} is larger than {LARGEST_JSON >> 20} MB", hint=REMEDY)
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise AssetError(f"{path} cannot be read: {error.strerror or error}", hint=REMEDY) from error
-    except (ValueError, RecursionError) as error:
-        if isinstance(error, AssetError):
-            raise
-        raise AssetError(f"{path} is no JSON file: {error}", hint=REMEDY) from error
+    content = files.read_json(path, "dataset file", hint=REMEDY)
     if not isinstance(content, dict):
         raise AssetError(f"{path} holds no JSON object", hint=REMEDY)
     return content

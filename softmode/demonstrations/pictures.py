@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softmode.errors import AssetError, needs_extra
-from softmode.files import storage_errors
+from softmode.files import damage_errors, storage_errors
 
+_FREE_PIXELS = 1 << 24
 _SPACE, _AGAIN = "free some space", "record the dataset again"
 
 
@@ -39,16 +40,14 @@ def decode_png(data: bytes, shape: tuple[int, ...], what: str) -> NDArray[np.uin
     """
     from PIL import Image
 
-    try:
+    if shape[0] * shape[1] > max(_FREE_PIXELS, 32 * len(data)):
+        raise AssetError(f"{what} is of {shape[1]} x {shape[0]} in {len(data)} bytes, which no picture is", hint=_AGAIN)
+    with damage_errors(what, hint=_AGAIN):
         with Image.open(io.BytesIO(data), formats=["PNG"]) as image:
             if (image.height, image.width) != shape[:2] or image.mode != "RGB":
                 found = f"{image.width} x {image.height} {image.mode}"
                 raise AssetError(f"{what} is a {found} picture, expected {shape[1]} x {shape[0]} RGB", hint=_AGAIN)
             return np.asarray(image, np.uint8)
-    except (OSError, ValueError, SyntaxError, EOFError) as error:
-        if isinstance(error, AssetError):
-            raise
-        raise AssetError(f"{what} is no readable PNG picture: {error}", hint=_AGAIN) from error
 
 
 def ffmpeg() -> Any:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from softmode.envs.task import Task
 from softmode.errors import ConfigError, StateError
-from softmode.files import archive_bytes, read_archive, write_archive
+from softmode.files import archive_bytes, damage_errors, read_archive, write_archive
 
 VERSION = 1
 """Version of the format of states."""
@@ -95,8 +95,13 @@ class EnvState:
         owner, random = header.get("owner"), header.get("random")
         if not isinstance(owner, dict) or not isinstance(random, list) or not random:
             raise StateError("the state says not whose it is", hint=hint)
-        if any(values.ndim != 2 or len(values) != len(random) for values in arrays.values()):
-            raise StateError(f"the state has arrays for another number of worlds than {len(random)}", hint=hint)
+        for state in random:
+            generator_of(state)
+        for name, values in arrays.items():
+            if values.ndim != 2 or len(values) != len(random):
+                raise StateError(f"the state has arrays for another number of worlds than {len(random)}", hint=hint)
+            if not name.startswith("hessian.") and not np.isfinite(values).all():  # those are kept unused, too
+                raise StateError(f"{name} of the state holds NaN or infinity", hint=hint)
         return cls(owner=owner, arrays=arrays, random=tuple(random))
 
     def _header(self) -> dict[str, Any]:
@@ -135,10 +140,8 @@ def generator_of(state: dict[str, Any] | None) -> np.random.Generator | None:
     if state is None:
         return None
     made = np.random.Generator(np.random.PCG64(0))
-    try:
+    with damage_errors("state of the random draws", hint="save the state again", error=StateError):
         made.bit_generator.state = state
-    except (KeyError, TypeError, ValueError) as error:
-        raise StateError("the state of the random draws cannot be read", hint="save the state again") from error
     return made
 
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softmode import __version__
-from softmode.errors import CheckpointError, ConfigError
-from softmode.files import read_archive, write_archive
+from softmode.errors import CheckpointError
+from softmode.files import damage_errors, read_archive, write_archive
 from softmode.learning.hyperparameters import Hyperparameters
 from softmode.learning.spaces import Interface
 
@@ -72,7 +72,7 @@ def read_checkpoint(path: str | os.PathLike[str]) -> Checkpoint:
     """
     hint = "give the policy.npz, best.npz or latest.npz of a run of this version of softmode"
     header, stored = read_archive(path, FORMAT, FORMAT_VERSION, what="checkpoint", hint=hint, error=CheckpointError)
-    try:
+    with damage_errors(f"checkpoint {path}", hint=hint, error=CheckpointError):
         if header["arrays"] != sorted(stored):
             raise ValueError("arrays are missing or were added")
         progress, privileged = header["progress"], header["privileged"]
@@ -88,8 +88,6 @@ def read_checkpoint(path: str | os.PathLike[str]) -> Checkpoint:
         hyperparameters = Hyperparameters.from_json(header["hyperparameters"])
         said = {name: header[name] for name in ("env", "env_options", "privileged", "progress")}
         return Checkpoint(**said, interface=interface, hyperparameters=hyperparameters, arrays=stored)
-    except (KeyError, TypeError, ValueError, AttributeError, OverflowError, ConfigError) as error:
-        raise CheckpointError(f"checkpoint {path}: damaged ({error})", hint=hint) from error
 
 
 def same_env(one: str, other: str) -> bool:

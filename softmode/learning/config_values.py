@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import types
 import typing
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from softmode.envs.catalogue import config_class, is_soft
 from softmode.errors import ConfigError
+from softmode.files import damage_errors
 from softmode.objects.fingerprint import find_file
 
 if TYPE_CHECKING:
@@ -35,12 +37,10 @@ def config_of(cls: type, values: dict[str, Any], start: Any = None) -> Any:
     unknown = sorted(set(values) - known)
     if unknown:
         raise ConfigError(f"{cls.__name__} has no field {unknown[0]!r}", hint=f"use one of {', '.join(sorted(known))}")
-    try:
+    with damage_errors(f"a field of {cls.__name__} has another type or value", hint="give numbers", error=ConfigError):
         start = cls() if start is None and not _required(cls) else start
         given = {name: _field_of(value, hints[name], getattr(start, name, None)) for name, value in values.items()}
         return cls(**given) if start is None else dataclasses.replace(start, **given)
-    except TypeError as error:
-        raise ConfigError(f"a field of {cls.__name__} has another type ({error})", hint="give numbers") from error
 
 
 def values_of(config: Any, start: Any = None) -> dict[str, Any]:
@@ -120,14 +120,25 @@ def pinned_options(env: str, options: dict[str, Any]) -> dict[str, Any]:
 
 
 def located_options(options: Any, folder: Path) -> Any:
-    """Return pinned options with the files that lie, by name and content, in a folder instead of their place of old."""
+    """Return pinned options with the files that lie, by name and content, in a folder instead of their place of old.
+
+    Raises:
+        ConfigError: If they are no options: of files without a name, or nested without end.
+        AssetError: If a file cannot be read.
+    """
+    with damage_errors("options of the environment", hint="use those of another run", error=ConfigError):
+        return _located(options, folder)
+
+
+def _located(options: Any, folder: Path) -> Any:
+    """Return options, or what stands in them, with files that are looked for in a folder."""
     if isinstance(options, list):
-        return [located_options(part, folder) for part in options]
+        return [_located(part, folder) for part in options]
     if not isinstance(options, dict):
         return options
     from softmode.objects.config import FIELD_FILES, FILES
 
-    found = {name: located_options(value, folder) for name, value in options.items()}
+    found = {name: _located(value, folder) for name, value in options.items()}
     for kind, its in (*((kind, "fingerprint") for kind in FILES), *FIELD_FILES.items()):
         fingerprint = found.get(its)
         if isinstance(fingerprint, str) and isinstance(path := found.get(kind), str):
@@ -143,6 +154,14 @@ def _required(cls: type) -> bool:
 def _field_of(value: Any, hint: Any, before: Any) -> Any:
     """Return the value of a field: dicts as configurations, lists as tuples."""
     arguments = typing.get_args(hint)
+    union = typing.get_origin(hint) in (typing.Union, types.UnionType)
+    kinds = [typing.get_origin(kind) or kind for kind in (arguments if union else (hint,))]
+    if value is not None or type(None) not in kinds:
+        kinds = [kind for kind in kinds if kind is not type(None)]
+        if all(dataclasses.is_dataclass(kind) for kind in kinds) and not isinstance(value, (dict, *kinds)):
+            raise ConfigError(f"{value!r} is no {kinds[0].__name__}", hint="give its fields by name")
+        if all(kind is tuple for kind in kinds) and not isinstance(value, list | tuple):
+            raise ConfigError(f"{value!r} is no list", hint="give one value after the other")
     if isinstance(value, dict) and isinstance(before, Mapping):
         unknown = sorted(set(value) - set(before))
         if unknown:

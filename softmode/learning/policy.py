@@ -14,6 +14,7 @@ import numpy as np
 
 from softmode.checks import require_number
 from softmode.errors import CheckpointError, ConfigError, needs_extra
+from softmode.files import damage_errors
 
 with needs_extra("rl", "trained policies need torch"):
     import torch
@@ -115,7 +116,8 @@ def load_policy(path: str | os.PathLike[str], device: str = "cpu") -> Policy:
         ConfigError: If the device is not there.
     """
     checkpoint = read_checkpoint(path)
-    options = located_options(checkpoint.env_options, Path(path).absolute().parent)
+    with damage_errors(f"checkpoint {path}: env_options", hint="use the file of another run", error=CheckpointError):
+        options = located_options(checkpoint.env_options, Path(path).absolute().parent)
     return Policy(dataclasses.replace(checkpoint, env_options=options), local_device(device), path)
 
 
@@ -125,7 +127,8 @@ def actor_of(checkpoint: Checkpoint, device: torch.device, path: object = "") ->
     Raises:
         CheckpointError: If arrays are missing or have other shapes than the header says.
     """
-    try:
+    what = f"checkpoint {path} holds other arrays than its header says"
+    with damage_errors(what, hint="use the file of another run", error=CheckpointError):
         with torch.device("meta"):  # takes no memory whatever the header says
             actor = Actor(checkpoint.interface, checkpoint.hyperparameters)
         arrays = {name: torch.from_numpy(array) for name, array in checkpoint.part("actor").items()}
@@ -133,10 +136,6 @@ def actor_of(checkpoint: Checkpoint, device: torch.device, path: object = "") ->
             if name in arrays and arrays[name].dtype != value.dtype:
                 raise ValueError(f"{name} is {arrays[name].dtype}, not {value.dtype}")
         actor.load_state_dict(arrays, strict=True, assign=True)
-    except (RuntimeError, ValueError, TypeError, OverflowError) as error:
-        raise CheckpointError(
-            f"checkpoint {path} holds other arrays than its header says ({error})", hint="use the file of another run"
-        ) from error
     return actor.to(device).eval()
 
 

@@ -12,8 +12,8 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
-from softmode.errors import RunError, needs_extra
-from softmode.files import free_name, storage_errors, whole_file
+from softmode.errors import AssetError, RunError, needs_extra
+from softmode.files import free_name, read_file, read_json, storage_errors, whole_file
 
 CONFIG, PROGRESS, LATEST, BEST = "config.json", "progress.csv", "latest.npz", "best.npz"
 """Names of the files of a run."""
@@ -62,10 +62,7 @@ class RunFolder:
         Raises:
             RunError: If it cannot be read.
         """
-        try:
-            config = json.loads((self.path / CONFIG).read_text())
-        except (OSError, ValueError, RecursionError) as error:
-            raise RunError(f"{self.path / CONFIG} cannot be read ({error})", hint="start a new run") from error
+        config = read_json(self.path / CONFIG, "configuration", hint="start a new run", error=RunError)
         if not isinstance(config, dict):
             raise RunError(f"{self.path / CONFIG} is no configuration", hint="start a new run")
         return config
@@ -87,17 +84,17 @@ class RunFolder:
     def forget_after(self, iteration: int) -> None:
         """Drop rows of the table behind the checkpoint that the run goes on from."""
         try:
-            with (self.path / PROGRESS).open(newline="") as file:
-                rows = list(csv.reader(file))
-        except (OSError, csv.Error):
+            text = read_file(self.path / PROGRESS, "progress", hint="start a new run").decode()
+            rows = list(csv.reader(io.StringIO(text, newline="")))
+        except (AssetError, ValueError, csv.Error):
             return
         if not rows:
             return
         kept = [row for row in rows[1:] if len(row) == len(rows[0]) and re.fullmatch(r"\d+", row[0])]
         kept = [row for row in kept if int(row[0]) <= iteration]
-        text = io.StringIO()
-        csv.writer(text, lineterminator="\n").writerows([rows[0], *kept])
-        self.write(PROGRESS, text.getvalue().encode())
+        table = io.StringIO()
+        csv.writer(table, lineterminator="\n").writerows([rows[0], *kept])
+        self.write(PROGRESS, table.getvalue().encode())
         self._columns = rows[0]
 
     def log(self, row: dict[str, float | int | None]) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softmode.errors import AssetError
-from softmode.files import read_archive, write_archive
+from softmode.files import damage_errors, read_archive, read_arrays, write_archive
 
 Real = NDArray[Any]
 """float32 or float64, as the particles were stepped."""
@@ -34,8 +34,7 @@ ARRAYS = (
 def is_morph(path: str | os.PathLike[str]) -> bool:
     """Return whether a file is an archive that says that it is a morph."""
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            return bool(json.loads(stored["header"].tobytes())["format"] == FORMAT)
+        return bool(json.loads(read_arrays(path, ("header",))["header"].tobytes())["format"] == FORMAT)
     except Exception:  # what reading any other file leads to
         return False
 
@@ -127,7 +126,7 @@ class MorphRun:
         """
         hint = "plan the morph again, or name another file"
         header, arrays = read_archive(path, FORMAT, VERSION, what="morph", hint=hint)
-        try:
+        with damage_errors(f"morph {path}", hint=hint):
             found = cls(
                 **{name: arrays[name] for name in ARRAYS},
                 ends=tuple(int(end) for end in header["ends"]),
@@ -138,8 +137,6 @@ class MorphRun:
                 notes=tuple(map(str, header["notes"])),
             )
             whole = found._is_whole()
-        except (KeyError, TypeError, ValueError, IndexError) as error:
-            raise AssetError(f"morph {path}: incomplete ({error!r})", hint=hint) from error
         if not whole:
             raise AssetError(f"morph {path}: its arrays do not belong together", hint=hint)
         return found

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import functools
 import hashlib
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from softmode.errors import AssetError
+from softmode.files import damage_errors, open_file, read_json
+from softmode.foreign.child.layers import inside
 
 _INDEX = (".json", ".gltf")
 """Suffixes of files that name others beside them: SOG v2, glTF."""
@@ -26,12 +27,9 @@ def file_fingerprint(path: Path) -> str:
     Raises:
         AssetError: If it cannot be read.
     """
-    try:
+    with damage_errors(f"object file {path}", hint="check the path"):
         file = path / "meta.json" if path.is_dir() else path
         return _fingerprint(file, file.stat().st_mtime_ns, file.stat().st_size)
-    except OSError as error:
-        what = f"object file {path}: cannot be read ({error.strerror or error})"
-        raise AssetError(what, hint="check the path") from error
 
 
 def find_file(path: Path, fingerprint: str, *folders: Path) -> Path | None:
@@ -45,12 +43,17 @@ def find_file(path: Path, fingerprint: str, *folders: Path) -> Path | None:
 @functools.lru_cache(maxsize=64)
 def _fingerprint(file: Path, changed: int, size: int) -> str:
     """Return the fingerprint of a file as it was at a time."""
-    digest = hashlib.sha256(file.read_bytes())
+    with open_file(file, "object file") as stream:
+        digest = hashlib.file_digest(stream, "sha256")
     if file.suffix.lower() in _INDEX:
-        named = {name for name in _strings(json.loads(file.read_text())) if Path(name).name == name}
-        for beside in sorted(file.parent / name for name in named if name):
-            if beside.is_file():
-                digest.update(beside.read_bytes())
+        named = {name for name in _strings(read_json(file, "object file")) if Path(name).name == name}
+        for name in sorted(named):
+            beside = file.parent / name
+            if name and not inside(str(beside), str(file.parent)):
+                raise AssetError(f"object file {file}: {name} leads outside of its folder", hint="copy it there")
+            if name and beside.is_file():
+                with open_file(beside, "object file") as stream:
+                    digest.update(stream.read())
     return digest.hexdigest()
 
 

@@ -31,7 +31,7 @@ def read_mesh(path: str | os.PathLike[str]) -> ColoredMesh:
     name = f"mesh file {file}"
     if not file.is_file():
         raise AssetError(f"{name}: no such file", hint="Check the path")
-    require_content(file, name)
+    require_content(file, "mesh file")
     answer = process.read("mesh", file, name=name, want="colors")
     textures = tuple(answer.arrays[k] for k in answer.described.pop("textures"))
     return ColoredMesh(**{key: answer.arrays[k] for key, k in answer.described.items()}, textures=textures, name=name)

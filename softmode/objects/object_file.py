@@ -13,7 +13,7 @@ import numpy as np
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.materials.material import Material
 from softmode.errors import AssetError
-from softmode.files import damage_errors
+from softmode.files import array_names, damage_errors
 from softmode.foreign import tokens
 from softmode.objects.presets import PRESETS
 from softmode.objects.soft_object import SoftObject
@@ -65,8 +65,9 @@ def read_object(path: str | os.PathLike[str]) -> SoftObject:
 
         return read_usd_body(path)
     body, stored = ReducedBody.load_with(path)
-    told = stored_material(body)
-    material = replace(Material(), **told) if told else None  # type: ignore[arg-type]  # its fields are numbers
+    with damage_errors(f"body file {path}: its material", hint="build the body again"):
+        told = stored_material(body)
+        material = replace(Material(), **told) if told else None  # type: ignore[arg-type]  # its fields are numbers
     held = {kind for kind in _PARTS if any(name.startswith(f"{kind}.") for name in stored)}
     missing = {f"{kind}.{name}" for kind in held for name in _PARTS[kind]} ^ set(stored)
     if missing:
@@ -92,7 +93,9 @@ def file_kind(path: str | os.PathLike[str]) -> FileKind:
         AssetError: If it is missing or cannot be read.
     """
     file = Path(path)
-    if not file.exists():
+    with damage_errors(f"file {file}", hint="check the path"):
+        exists = file.exists()
+    if not exists:
         named = len(file.parts) == 1 and not file.suffix
         hint = f"check the path, or name a preset: {', '.join(PRESETS)}" if named else "check the path"
         raise AssetError(f"file {file}: no such file", hint=hint)
@@ -100,8 +103,8 @@ def file_kind(path: str | os.PathLike[str]) -> FileKind:
     if is_radiance(file):
         return "radiance"
     if suffix == ".npz":
-        with damage_errors(f"file {file}", hint="build or write it again"), np.load(file, allow_pickle=False) as stored:
-            return "points" if "points" in stored.files and "header" not in stored.files else "body"
+        names = array_names(file, hint="build or write it again")
+        return "points" if "points" in names and "header" not in names else "body"
     if suffix == ".ply":
         found = ply_kind(file)
         return "splat" if found == "splats" else "mesh" if found == "mesh" else "points"

@@ -10,7 +10,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,8 +17,9 @@ from scipy.spatial import KDTree
 
 from softmode.checks import require_number
 from softmode.errors import AssetError, ConfigError, MaterialError
-from softmode.files import read_arrays
+from softmode.files import UNPACKED_FREE, damage_errors, read_arrays
 from softmode.objects.primitives import Color
+from softmode.splats.point_cloud import distinct
 from softmode.splats.splats import Splats
 
 Array = NDArray[np.float64]
@@ -83,13 +83,16 @@ def nearest_field(points: ArrayLike, values: ArrayLike) -> Field:
     """
     x, factors = np.asarray(points, dtype=np.float64), np.asarray(values, dtype=np.float64)
     if x.ndim != 2 or x.shape[1] != 3 or factors.shape != (len(x),) or not len(x) or not np.isfinite(x).all():
-        raise MaterialError(f"field: expected points (N > 0, 3) and values (N,), got {x.shape} and {factors.shape}")
+        what = f"field: expected points (N > 0, 3), finite, and values (N,), got {x.shape} and {factors.shape}"
+        raise MaterialError(what, hint="give one factor for each point")
     bad = np.flatnonzero(~((factors >= FACTORS[0]) & (factors <= FACTORS[1])))
     if len(bad):
         raise MaterialError(
-            f"field: factors must lie in {FACTORS[0]:g}..{FACTORS[1]:g}, got {factors[bad[0]]} at row {bad[0]}"
+            f"field: factors must lie in {FACTORS[0]:g}..{FACTORS[1]:g}, got {factors[bad[0]]} at row {bad[0]}",
+            hint="a factor is that of the material there over that of the body",
         )
-    tree = KDTree(x)
+    first, _ = distinct(x)
+    tree, factors = KDTree(x[first]), factors[first]
 
     def field(places: Array) -> Array:
         return factors[np.asarray(tree.query(places)[1])]
@@ -126,12 +129,11 @@ def read_field(path: str | os.PathLike[str]) -> Field:
         MaterialError: If a factor lies outside 0.001..1000.
     """
     hint = "give an .npz with points (N, 3) and factors (N,)"
-    if not Path(path).is_file():
-        raise AssetError(f"field {path}: no such file", hint="check the path")
-    arrays = read_arrays(Path(path), ("points", "factors"), what="field", hint=hint)
+    arrays = read_arrays(path, ("points", "factors"), what="field", hint=hint, free=UNPACKED_FREE // 2)
     if arrays.keys() < {"points", "factors"}:
         raise AssetError(f"field {path}: holds {sorted(arrays)}", hint=hint)
-    return nearest_field(arrays["points"], arrays["factors"])
+    with damage_errors(f"field {path}", hint=hint):
+        return nearest_field(arrays["points"], arrays["factors"])
 
 
 def brushed(points: Array, touched: Array, inward: Array, radius: float, depth: float) -> NDArray[np.bool_]:

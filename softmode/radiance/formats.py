@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +12,9 @@ import warp as wp
 from numpy.typing import NDArray
 
 from softmode.errors import AssetError
-from softmode.files import damage_errors, read_arrays, whole_file
+from softmode.files import array_names, damage_errors, read_arrays, read_file, write_compressed
 from softmode.radiance.grid import RadianceGrid, check_size, sh_of_colors
-from softmode.radiance.nanovdb import BYTE_LIMIT, checked
+from softmode.radiance.nanovdb import checked
 from softmode.radiance.nanovdb_kernels import read_values
 
 SUFFIXES = (".npz", ".nvdb")
@@ -25,6 +23,7 @@ _OURS = ("density", "sh", "origin", "axes")
 _PLAIN = ("density", "bounds")
 _PLENOXELS = ("links", "density_data", "sh_data", "radius", "center")
 _HINT = "export it again"
+_FREE, _DENSE_FREE = 48 << 20, 256 << 20
 
 
 def is_radiance(path: str | os.PathLike[str]) -> bool:
@@ -38,8 +37,8 @@ def is_radiance(path: str | os.PathLike[str]) -> bool:
         return True
     if file.suffix.lower() != ".npz":
         return False
-    with damage_errors(f"file {file}", hint=_HINT), np.load(file, allow_pickle=False) as stored:
-        return set(stored.files) >= set(_PLAIN[:1]) or set(stored.files) >= set(_PLENOXELS[:3])
+    names = array_names(file, hint=_HINT)
+    return names >= set(_PLAIN[:1]) or names >= set(_PLENOXELS[:3])
 
 
 def read_radiance(path: str | os.PathLike[str]) -> RadianceGrid:
@@ -57,19 +56,19 @@ def read_radiance(path: str | os.PathLike[str]) -> RadianceGrid:
     if file.suffix.lower() not in SUFFIXES:
         raise AssetError(f"radiance field {file}: cannot read {file.suffix or 'no suffix'!r}",
                          hint=f"readable are {', '.join(SUFFIXES)}")  # fmt: skip
-    if not file.is_file():
-        raise AssetError(f"radiance field {file}: does not exist", hint="check the path")
-    if file.suffix.lower() == ".nvdb":
-        return _read_nanovdb(file)
-    _check_headers(file)
-    arrays = read_arrays(file, {*_OURS, *_PLAIN, *_PLENOXELS, "rgb", "basis_type"}, what="radiance field", hint=_HINT)
+    with damage_errors(f"radiance field {file}", hint=_HINT):
+        return _read_nanovdb(file) if file.suffix.lower() == ".nvdb" else _read_npz(file)
+
+
+def _read_npz(file: Path) -> RadianceGrid:
+    """Return the field of an .npz."""
+    names = {*_OURS, *_PLAIN, *_PLENOXELS, "rgb", "basis_type"}
+    arrays = read_arrays(file, names, what="radiance field", hint=_HINT, free=_FREE)
     name = file.name
     if set(arrays) >= set(_OURS):
         return RadianceGrid(**{key: arrays[key] for key in _OURS}, name=name)
     if set(arrays) >= set(_PLENOXELS):
-        with damage_errors(f"radiance field {name}", hint=_HINT):
-            found = _plenoxels(arrays, name)
-        return found
+        return _plenoxels(arrays, name)
     if not set(arrays) >= set(_PLAIN) or not ({"sh", "rgb"} & set(arrays)):
         raise AssetError(
             f"radiance field {name}: holds {sorted(arrays) or 'none of the known keys'}",
@@ -80,7 +79,7 @@ def read_radiance(path: str | os.PathLike[str]) -> RadianceGrid:
 
 
 def write_radiance(path: str | os.PathLike[str], field: RadianceGrid) -> None:
-    """Write a field as a compressed .npz; the file appears whole or not at all.
+    """Write a field as an .npz, compressed unless it is nearly empty; the file appears whole or not at all.
 
     Raises:
         AssetError: If the suffix is another.
@@ -88,36 +87,29 @@ def write_radiance(path: str | os.PathLike[str], field: RadianceGrid) -> None:
     """
     if Path(path).suffix.lower() != ".npz":
         raise AssetError(f"radiance field {path}: cannot write this kind", hint="name it like toy.npz")
-    with whole_file(path, "radiance field") as file:
-        np.savez_compressed(file, **{name: getattr(field, name) for name in _OURS})
+    write_compressed(path, {name: getattr(field, name) for name in _OURS}, "radiance field")
 
 
-def _colors(rgb: NDArray[Any], name: str) -> NDArray[np.float64]:
-    """Return the coefficients of colours 0..1."""
+def _colors(rgb: NDArray[Any], name: str) -> NDArray[np.float16]:
+    """Return the coefficients of colours 0..1, shape (nx, ny, nz, 1, 3), with little memory beside them."""
     if rgb.ndim != 4 or rgb.shape[3] != 3 or rgb.dtype.kind not in "fiu":
         raise AssetError(f"radiance field {name}: rgb has shape {rgb.shape}, expected (nx, ny, nz, 3)", hint=_HINT)
-    return sh_of_colors(rgb / 255.0 if rgb.dtype == np.uint8 else rgb)[..., None, :]
+    found = np.empty((*rgb.shape[:3], 1, 3), np.float16)
+    for slab, of in zip(found, rgb, strict=True):
+        slab[...] = sh_of_colors(of / 255.0 if rgb.dtype == np.uint8 else of)[..., None, :]
+    return found
 
 
-def _check_headers(file: Path) -> None:
-    """Refuse arrays that are too large before any of them is read, and what is no .npz.
+def _check_dense(name: str, nodes: int, each: int, stored: int) -> None:
+    """Refuse what lies apart in so large a box that most of the grid would be empty.
 
     Raises:
-        AssetError: If one is.
+        AssetError: If nodes of so many bytes each take much more than what is stored of them.
     """
-    with damage_errors(f"radiance field {file}", hint=_HINT), zipfile.ZipFile(file) as archive:
-        sizes = {}
-        for member in archive.namelist():
-            with archive.open(member) as stream:
-                version = np.lib.format.read_magic(stream)
-                read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-                shape, _, dtype = read(stream)
-                sizes[member] = math.prod(shape) * dtype.itemsize
-    large = [name for name, size in sizes.items() if size > BYTE_LIMIT]
-    if large:
+    if nodes * each > max(_DENSE_FREE, 8 * stored):
         raise AssetError(
-            f"radiance field {file}: {large[0]} has {sizes[large[0]]} bytes, at most {BYTE_LIMIT}",
-            hint="export it at a lower resolution",
+            f"radiance field {name}: {stored} bytes fill a grid of {nodes} nodes, {nodes * each} bytes",
+            hint="crop it, or export it at a lower resolution",
         )
 
 
@@ -141,6 +133,7 @@ def _plenoxels(arrays: dict[str, NDArray[Any]], name: str) -> RadianceGrid:
             hint="train with spherical harmonics of degree 0, 1 or 2",
         )
     check_size(name, links.size, sh.shape[1] // 3)
+    _check_dense(name, links.size, 8 + 4 * sh.shape[1], sum(array.nbytes for array in arrays.values()))
     if kept and (links.max() >= kept or links.min() < -1):
         raise AssetError(f"radiance field {name}: links point to voxels that are not there", hint=_HINT)
     radius = np.broadcast_to(np.asarray(arrays["radius"], np.float64).ravel(), 3)
@@ -158,23 +151,20 @@ def _plenoxels(arrays: dict[str, NDArray[Any]], name: str) -> RadianceGrid:
 
 def _read_nanovdb(file: Path) -> RadianceGrid:
     """Return the field of the grids of a NanoVDB file, on its active voxels and a rim around them."""
-    try:
-        content = checked(file.read_bytes())
-    except (OSError, ValueError, zlib.error) as error:
-        raise AssetError(f"radiance field {file}: {error}", hint=_HINT) from error
-    with damage_errors(f"radiance field {file}", hint=_HINT):
-        volumes = [wp.Volume.load_from_nvdb(content, device="cpu")]
-        while (following := volumes[-1].load_next_grid()) is not None:
-            volumes.append(following)
-        scalars = [volume for volume in volumes if volume.dtype == wp.float32]
-        vectors = [volume for volume in volumes if volume.dtype == wp.vec3f]
-        active = scalars[0].get_voxels().numpy() if scalars else np.zeros((0, 3), np.int32)
+    content = checked(read_file(file, "radiance field", hint=_HINT))
+    volumes = [wp.Volume.load_from_nvdb(content, device="cpu")]
+    while (following := volumes[-1].load_next_grid()) is not None:
+        volumes.append(following)
+    scalars = [volume for volume in volumes if volume.dtype == wp.float32]
+    vectors = [volume for volume in volumes if volume.dtype == wp.vec3f]
+    active = scalars[0].get_voxels().numpy() if scalars else np.zeros((0, 3), np.int32)
     if not len(active):
         hint = "write the density as a grid of 32-bit floats"
         raise AssetError(f"radiance field {file}: no grid of numbers with active voxels", hint=hint)
-    low, high = active.min(axis=0) - 1, active.max(axis=0) + 2
+    low, high = active.min(axis=0).astype(np.int64) - 1, active.max(axis=0).astype(np.int64) + 2
     shape = tuple(int(n) for n in high - low)
     check_size(file.name, math.prod(shape), 1)
+    _check_dense(file.name, math.prod(shape), 32, len(content))
     info = scalars[0].get_grid_info()
     axes = np.array(info.transform_matrix, dtype=np.float64).reshape(3, 3)
     values = wp.zeros(shape, dtype=wp.float32, device="cpu")
@@ -184,5 +174,5 @@ def _read_nanovdb(file: Path) -> RadianceGrid:
     origin = np.array(info.translation, dtype=np.float64) + axes @ low
     density = np.maximum(values.numpy(), 0.0)
     return RadianceGrid(
-        density=density, sh=sh_of_colors(colors.numpy())[..., None, :], origin=origin, axes=axes, name=file.name
+        density=density, sh=_colors(colors.numpy(), file.name), origin=origin, axes=axes, name=file.name
     )

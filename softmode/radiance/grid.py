@@ -55,7 +55,8 @@ class RadianceGrid:
         density = self._numbers("density", self.density)
         if density.ndim != 3 or min(density.shape) < 2:
             raise AssetError(
-                f"{self.name}: density has shape {density.shape}, expected (nx, ny, nz) of at least 2 nodes each"
+                f"{self.name}: density has shape {density.shape}, expected (nx, ny, nz) of at least 2 nodes each",
+                hint="give numbers on the nodes of a box",
             )
         shape = np.shape(self.sh)
         if len(shape) != 5 or shape[:3] != density.shape or shape[3:] not in ((1, 3), (4, 3), (9, 3)):
@@ -80,8 +81,8 @@ class RadianceGrid:
                 f"{self.name}: the nodes' axes are no rotation times lengths", hint="export it without shear or mirror"
             )
         values = {
-            "density": np.minimum(density, DENSITY_LIMIT).astype(np.float16),
-            "sh": np.clip(sh, -DENSITY_LIMIT, DENSITY_LIMIT).astype(np.float16),
+            "density": np.minimum(density, DENSITY_LIMIT).astype(np.float16, copy=False),
+            "sh": np.clip(sh, -DENSITY_LIMIT, DENSITY_LIMIT).astype(np.float16, copy=False),
             "origin": origin,
             "axes": axes,
         }

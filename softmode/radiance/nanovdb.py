@@ -22,7 +22,7 @@ BYTE_LIMIT = 2**31
 VOXEL_LIMIT = 2**28
 """Most active voxels of a grid."""
 _FILE, _META, _GRID, _TREE = 16, 176, 672, 64
-_BLOCK = 1 << 12
+_BLOCK, _FREE = 1 << 12, 64 << 20
 _EMPTY = 0xFFFFFFFF
 _PLAIN, _ZIP = 0, 1
 
@@ -47,7 +47,8 @@ def checked(content: bytes) -> bytes:
         size, packed = struct.unpack_from("<QQ", meta)
         name = _part(content, at + _META, struct.unpack_from("<I", meta, 136)[0])
         total += size
-        _require(total <= BYTE_LIMIT, f"{total} bytes unpacked, at most {BYTE_LIMIT}")
+        most = min(BYTE_LIMIT, max(_FREE, 8 * len(content)))
+        _require(total <= most, f"{total} bytes unpacked, at most {most}")
         _require(codec == _ZIP or size == packed, "sizes that do not match")
         struct.pack_into("<Q", meta, 8, size)
         struct.pack_into("<H", meta, 168, _PLAIN)
@@ -86,7 +87,8 @@ def _check_grid(grid: bytes) -> None:
     size = struct.unpack_from("<Q", grid, 32)[0]
     _require(size == len(grid), f"a grid of {len(grid)} bytes that says {size}")
     upper, voxels = struct.unpack_from("<Q", grid, _GRID + 16)[0], struct.unpack_from("<Q", grid, _GRID + 56)[0]
-    _require(voxels <= VOXEL_LIMIT, f"{voxels} active voxels, at most {VOXEL_LIMIT}")
+    most = min(VOXEL_LIMIT, max(2**22, len(grid)))
+    _require(voxels <= most, f"{voxels} active voxels in {len(grid)} bytes, at most {most}")
     if head == tail == _EMPTY:
         return
     recent = (version >> 21, version >> 10 & 0x7FF, version & 0x3FF) > (MAJOR, 6, 0)

@@ -142,7 +142,7 @@ class _Tape:
             self._whole = False
             return
         given = [None if x is None else x._obj for x in (bounds, arguments)]
-        self._add(Operation.LAUNCH, ctypes.cast(function, ctypes.c_void_p).value or 0, *map(self._keep, given))
+        self._add(Operation.LAUNCH, _number(function), *map(self._keep, given))
 
     def _note_copy(self, target: Any, source: Any, size: Any) -> None:
         if _number(size):

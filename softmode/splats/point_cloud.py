@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
 from softmode.errors import AssetError
-from softmode.files import read_arrays, require_content
+from softmode.files import open_file, read_arrays, require_content
 from softmode.foreign import process
 from softmode.splats.formats.common import sh_from_colors
 from softmode.splats.mesh_samples import frames_of
@@ -18,6 +18,11 @@ from softmode.splats.splats import MAX_SPLATS, Splats, quats_from_rotations
 
 GREY = 0.62
 """Colour of points that have none."""
+_FAR = 1.0e15
+"""Coordinates below it have squares and areas that float32 holds [m]."""
+_BLOCK = 1 << 14
+_PRIMES = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
+_POINTS_FREE = 12 << 20
 _HINT = "Give an .npz with points (N, 3), and normals and colors (N, 3) if there are any"
 
 
@@ -35,12 +40,9 @@ def ply_kind(path: str | os.PathLike[str]) -> str:
     Raises:
         AssetError: If the file is missing, cannot be read, holds nothing, or is no .ply.
     """
-    try:
-        require_content(Path(path), f"file {path}")
-        with open(path, "rb") as file:
-            head = file.read(64 * 1024).split(b"end_header")[0]
-    except OSError as error:
-        raise AssetError(f"file {path}: cannot be read ({error.strerror or error})", hint="Check the path") from error
+    require_content(Path(path), "file")
+    with open_file(path) as file:
+        head = file.read(64 * 1024).split(b"end_header")[0]
     words = [line.split() for line in head.splitlines()]
     if [b"element", b"vertex", b"0"] in words:
         raise AssetError(f"file {path}: holds no points", hint="Export the asset again")
@@ -62,11 +64,9 @@ def read_points(path: str | os.PathLike[str]) -> Splats:
     """
     file = Path(path)
     name = f"point cloud {file}"
-    if not file.is_file():
-        raise AssetError(f"{name}: no such file", hint="Check the path")
-    require_content(file, name)
+    require_content(file, "point cloud")
     if file.suffix.lower() == ".npz":
-        arrays = read_arrays(file, ("points", "normals", "colors"), what="point cloud", hint=_HINT)
+        arrays = read_arrays(file, ("points", "normals", "colors"), what="point cloud", hint=_HINT, free=_POINTS_FREE)
         if "points" not in arrays:
             raise AssetError(f"{name}: holds no points", hint=_HINT)
         return splats_from_points(arrays["points"], arrays.get("normals"), arrays.get("colors"), name=name)
@@ -91,32 +91,40 @@ def splats_from_points(
     x = _array(f"{name}: points", points, None)
     if not 4 <= len(x) <= MAX_SPLATS:
         raise AssetError(f"{name}: {len(x)} points, expected 4 to {MAX_SPLATS}", hint=_HINT)
-    tree = KDTree(x)
-    pitch = tree.query(x, k=min(7, len(x)))[0][:, -1] / 1.5  # the sixth neighbour is one and a half spacings away
-    typical = float(np.median(pitch))
-    if not typical > 0.0:
+    first, back = distinct(x)
+    places = x if len(first) == len(x) else x[first]
+    if not len(x) // 7 < len(places) >= 4:
         raise AssetError(f"{name}: most points coincide", hint="Remove repeated points")
-    pitch = np.clip(pitch, 0.5 * typical, 2.0 * typical)
-    if normals is None:
-        near = x[tree.query(x, k=min(12, len(x)))[1]]
-        near = near - near.mean(axis=1, keepdims=True)
-        frame = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near))[1][:, :, ::-1]
-    else:
-        frame = _frames(_array(f"{name}: normals", normals, len(x)))
-    frame = frame * np.sign(np.linalg.det(frame))[:, None, None]
-    shade = np.full((len(x), 3), GREY)
+    given = None if normals is None else _array(f"{name}: normals", normals, len(x))[first]
+    tree, count = KDTree(places), min(7 if normals is not None else 12, len(places))
+    pitch, quats = np.empty(len(places)), np.empty((len(places), 4), dtype=np.float32)
+    for start in range(0, len(places), _BLOCK):  # what the neighbours of a point take is many times the point
+        part = slice(start, start + _BLOCK)
+        away, index = tree.query(places[part], k=count)
+        pitch[part] = away[:, : min(7, count)][:, -1] / 1.5  # the sixth neighbour is one and a half spacings away
+        if given is None:
+            near = places[index] - places[index].mean(axis=1, keepdims=True)
+            frame = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near))[1][:, :, ::-1]
+        else:
+            frame = _frames(given[part])
+        quats[part] = quats_from_rotations(frame * np.sign(np.linalg.det(frame))[:, None, None])
+    typical = float(np.median(pitch))
+    pitch = np.clip(pitch, 0.5 * typical, 2.0 * typical)[back]
+    shade = np.full((1, 3), GREY)
     if colors is not None:
         shade = _array(f"{name}: colors", colors, len(x))
         if np.issubdtype(np.asarray(colors).dtype, np.integer):
             shade = shade / 255.0
-    return Splats(
-        means=x,
-        quats=quats_from_rotations(frame),
-        scales=pitch[:, None] * np.array([0.6, 0.6, 0.05]),
-        opacities=np.full(len(x), 0.95),
-        sh=sh_from_colors(np.clip(shade, 0.0, 1.0)),
-        name=name,
-    )
+    sh = sh_from_colors(np.clip(shade, 0.0, 1.0)).astype(np.float32)
+    arrays = {
+        "means": x.astype(np.float32),
+        "quats": quats[back],
+        "scales": np.stack([(pitch * width).astype(np.float32) for width in (0.6, 0.6, 0.05)], axis=1),
+        "opacities": np.full(len(x), 0.95, np.float32),
+        "sh": np.broadcast_to(sh, (len(x), 1, 3)),
+    }
+    del x, places, tree, given, shade, pitch  # splats take as much again while they are checked
+    return Splats(**arrays, name=name)
 
 
 def _frames(normals: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -133,6 +141,20 @@ def _array(name: str, value: ArrayLike, count: int | None) -> NDArray[np.float64
         raise AssetError(f"{name}: no array of numbers", hint=_HINT) from error
     if array.ndim != 2 or array.shape[1] != 3 or (count is not None and len(array) != count):
         raise AssetError(f"{name}: expected shape ({count or 'N'}, 3), got {array.shape}", hint=_HINT)
-    if not np.isfinite(array).all():
-        raise AssetError(f"{name}: not all finite", hint="Remove the points that hold NaN or infinity")
+    if array.size and not np.abs(array).max() < _FAR:
+        raise AssetError(f"{name}: not all finite", hint=f"Remove what is NaN, infinite or beyond {_FAR:g}")
     return array
+
+
+def distinct(points: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the first point at each place, shape (M,), and which place each point has, shape (N,).
+
+    A tree does not tell points at one place apart: asked for neighbours it looks at all of them, for each of them.
+    """
+    x, y, z = ((points + 0.0).view(np.uint64) * _PRIMES).T  # places are told apart by 64 mixed bits
+    _, first, back = np.unique(
+        x ^ (y >> np.uint64(21)) ^ (z >> np.uint64(42)) ^ y ^ z, return_index=True, return_inverse=True
+    )
+    if len(first) == len(points):
+        first = back = np.arange(len(points))
+    return first, back

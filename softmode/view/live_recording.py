@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from softmode.checks import require_number
 from softmode.deformables.model.namespaces import soft
-from softmode.errors import AssetError, ConfigError
-from softmode.files import read_arrays
+from softmode.errors import ConfigError
+from softmode.files import damage_errors, read_arrays, write_compressed
 from softmode.scenes.scene import Scene
 
 _FORMAT = "softmode live recording 2"
@@ -43,17 +43,21 @@ class LiveRecording:
         hint = "record it again"
         names = ("format", "times", "q", "dent", "body_q", "fingerprints")
         data = read_arrays(path, names, what="recording", hint=hint)
-        if set(names) != set(data):
-            raise AssetError(f"recording {path} is not one of a live session", hint=hint)
-        times, columns = data["times"], {"q": data["q"], "dent": data["dent"], "body_q": data["body_q"]}
-        good = str(data["format"]) == _FORMAT and times.ndim == 1
-        for (name, values), width in zip(columns.items(), (3, 3, 7), strict=True):
-            good = good and values.ndim == 3 and len(values) == len(times) and values.shape[2] == width
-            columns[name] = values.astype(np.float64 if name == "q" else np.float32)
-        if not good or not all(np.isfinite(x).all() for x in (times, *columns.values())):
-            raise AssetError(f"recording {path} is not one of a live session", hint=hint)
-        prints = tuple(str(x) for x in data["fingerprints"])
-        return cls(times=times, fingerprints=prints, **columns)
+        kinds = {"times": np.float64, "q": np.float64, "dent": np.float32, "body_q": np.float32}
+        with damage_errors(f"recording {path}", hint=hint):
+            columns = {name: data[name].astype(kind, copy=False) for name, kind in kinds.items()}
+            shapes = {"times": (), "q": (-1, 3), "dent": (-1, 3), "body_q": (-1, 7)}
+            if str(data["format"]) != _FORMAT or data["fingerprints"].ndim != 1:
+                raise ValueError("it is not one of a live session")
+            for name, shape in shapes.items():
+                found = columns[name].shape
+                wanted = (
+                    columns["times"].size,
+                    *(have if want < 0 else want for want, have in zip(shape, found[1:], strict=True)),
+                )
+                if found != wanted or not np.isfinite(columns[name]).all():
+                    raise ValueError(f"{name} has shape {found}, expected {wanted}, or is not finite")
+            return cls(fingerprints=tuple(map(str, data["fingerprints"])), **columns)
 
     def check(self, scene: Scene, index: int) -> None:
         """Raise unless it is of the objects of a scene, and has a frame.
@@ -82,6 +86,5 @@ class LiveRecording:
 
     def save(self, path: Path) -> None:
         """Write it to a file."""
-        with path.open("wb") as file:
-            arrays = {"format": np.array(_FORMAT), **vars(self), "fingerprints": np.array(self.fingerprints)}
-            np.savez_compressed(file, **arrays)
+        arrays = {"format": np.array(_FORMAT), **vars(self), "fingerprints": np.array(self.fingerprints)}
+        write_compressed(path, arrays, "recording")

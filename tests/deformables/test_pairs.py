@@ -464,7 +464,7 @@ def stack(count=3, **kw):
 def test_stack_carries_its_weight():
     """Three soft cubes at rest: the net force on each is its weight to 1e-4, whichever it stands on.
 
-    After 300 steps what still sways was 0.55 of the tolerance with one processor and 0.79 with another; after 500, 0.15.
+    After 300 steps what still swayed was 0.55 and 0.79 of the tolerance, by the processor; after 500, 0.15.
     """
     scene = stack()
     replay = scene.capture()

@@ -238,7 +238,7 @@ def test_sog_members_cannot_escape(tmp_path: Path, name: Any) -> None:
         (("means", "maxs"), [1e9, 1.0, 1.0], "means"),
         (("scales", "codebook"), [0.0] * 255, "expected 256 numbers"),
         (("scales", "codebook"), [float("nan")] * 256, "NaN"),
-        (("sh0", "files"), ["absent.webp"], "missing"),
+        (("sh0", "files"), ["absent.webp"], "does not exist"),
         (("shN", "bands"), 4, "integer"),
         (("shN", "bands"), 2, "512 wide"),
     ],

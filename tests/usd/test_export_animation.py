@@ -17,7 +17,6 @@ import warp as wp
 
 from softmode.deformables.model.authoring import add_reduced_body
 from softmode.errors import AssetError, ConfigError, SolverDiverged, StorageError
-from softmode.foreign import process
 from softmode.objects import Placed, SoftObject
 from softmode.scenes import BoundSplats
 from softmode.splats.formats import read_usd
@@ -32,7 +31,6 @@ from softmode.usd import (
     write_usd,
 )
 from softmode.usd.dents import Dents
-from softmode.usd.playback import animation_from_answer, animation_request
 from tests.usd.export_scenes import (
     KINDS,
     MATERIAL,
@@ -42,7 +40,6 @@ from tests.usd.export_scenes import (
     small_splats,
     some_state,
 )
-from tests.usd.test_damage import mutate
 
 pytest.importorskip("pxr", reason="needs the extra [usd]")
 Gf, Usd, UsdGeom = (importlib.import_module(f"pxr.{name}") for name in ("Gf", "Usd", "UsdGeom"))
@@ -393,26 +390,3 @@ def test_what_is_no_animation_is_refused(tmp_path: Path) -> None:
     stage.GetRootLayer().Save()
     with pytest.raises(AssetError, match=r"c\.usda"):
         read_animation(tmp_path / "c.usda")
-
-
-def test_damaged_animations(tmp_path: Path) -> None:
-    """60 damaged text and binary files: an animation that is whole, or a typed error; the process that called lives."""
-    Scene("affine").record(tmp_path / "a.usda")
-    Scene("affine").record(tmp_path / "a.usdc")
-    valid = [(tmp_path / f"a.{suffix}").read_bytes() for suffix in ("usda", "usdc")]
-    requests = []
-    for trial in range(60):
-        path = tmp_path / f"{trial}.usd"
-        path.write_bytes(mutate(valid[trial % 2], np.random.default_rng(trial)))
-        requests.append(animation_request(path, str(tmp_path / f"answer_{trial}")))
-    refused = 0
-    for request in requests:
-        try:
-            found = animation_from_answer(process.ask(request, name="file"), "file")
-            for played in found.bodies:
-                assert np.isfinite(played.coordinates).all() and np.isfinite(played.times).all()
-                assert_same(played.object.body, small_body("affine"))
-        except AssetError as error:
-            assert error.message and error.hint
-            refused += 1
-    assert 15 < refused < 60

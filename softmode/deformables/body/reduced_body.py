@@ -32,7 +32,7 @@ from softmode.deformables.body.rkpm import BasisRKPM, KernelName
 from softmode.deformables.body.skinning_weights import SkinningWeights
 from softmode.deformables.body.visibility import Visibility
 from softmode.errors import AssetError, BasisError, ConfigError
-from softmode.files import read_archive, write_archive
+from softmode.files import damage_errors, read_archive, write_archive
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -443,14 +443,10 @@ class ReducedBody:
         if set(header) | set(arrays) != names or set(header) & set(arrays):
             wrong = sorted(names ^ (set(header) | set(arrays)))
             raise AssetError(f"{source}: fields {wrong} do not match", hint=hint)
-        try:
+        with damage_errors(source, hint=hint):
             values: dict[str, Any] = {**header, **arrays, "region_names": tuple(header["region_names"])}
             body = cls(**values)
             body.check()
-        except BasisError as error:
-            raise AssetError(f"{source}: {error.message}", hint=hint) from error
-        except (TypeError, IndexError, AttributeError, KeyError, ValueError) as error:
-            raise AssetError(f"{source}: a field has another type or shape ({error})", hint=hint) from error
         return body
 
     def save(

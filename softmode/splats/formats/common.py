@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
-import struct
-import zipfile
-import zlib
-from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from softmode.errors import AssetError
+from softmode.files import damage_errors
 from softmode.splats.splats import MAX_SPLATS, SH_DC
 
 REEXPORT = "The file is damaged or incomplete: copy or export it again"
@@ -22,8 +18,8 @@ REEXPORT = "The file is damaged or incomplete: copy or export it again"
 
 FREE_BYTES = 8 * 2**20
 """Bytes that anything may unpack to however small it is: Zstandard and WebP pack what is all the same without limit."""
-MAX_RATIO = 1032
-"""Largest ratio of unpacked to packed bytes that a reader accepts: what deflate can reach at most."""
+MAX_RATIO = 32
+"""Largest ratio of unpacked to packed bytes that a reader accepts beyond that: real splats pack by less than ten."""
 
 
 def unreadable(path: object, problem: str, hint: str = REEXPORT) -> AssetError:
@@ -37,26 +33,9 @@ def unreadable(path: object, problem: str, hint: str = REEXPORT) -> AssetError:
     return AssetError(f"splat file {path}: {problem}", hint=hint)
 
 
-@contextlib.contextmanager
-def typed_errors(name: str) -> Iterator[None]:
-    """Turn what the file system and the decoders raise on damaged input into AssetError."""
-    try:
-        yield
-    except AssetError:
-        raise
-    except (
-        OSError,
-        EOFError,
-        zipfile.BadZipFile,
-        zlib.error,
-        struct.error,
-        NotImplementedError,
-        RuntimeError,
-        SyntaxError,
-    ) as error:
-        raise unreadable(name, f"cannot be read ({error})") from error
-    except (ValueError, OverflowError, MemoryError, Image.DecompressionBombError) as error:
-        raise unreadable(name, f"holds invalid data ({error})") from error
+def typed_errors(name: str) -> AbstractContextManager[None]:
+    """Return the context in which whatever reading a splat file raises becomes AssetError."""
+    return damage_errors(f"splat file {name}", hint=REEXPORT)
 
 
 def check_count(count: int, name: str) -> int:

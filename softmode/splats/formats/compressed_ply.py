@@ -69,9 +69,11 @@ def decode_compressed(chunk: NDArray[Any], vertex: NDArray[Any], sh: NDArray[Any
         if len(sh) != count or len(names) not in (9, 24, 45):
             raise unreadable(path, f"{len(sh)} rows of {len(names)} spherical harmonics for {count} splats")
         _require_columns(sh, names, "u1", "sh", path)
-        codes = np.stack([sh[name] for name in names], axis=1)
-        rest = _SH_CODES[codes].reshape(count, 3, -1).transpose(0, 2, 1)
-        coefficients = np.concatenate([coefficients, rest], axis=1)
+        first, coefficients = coefficients, np.empty((count, 1 + len(names) // 3, 3), dtype=np.float32)
+        coefficients[:, 0] = first[:, 0]
+        for k, name in enumerate(names):
+            channel, order = divmod(k, len(names) // 3)
+            coefficients[:, 1 + order, channel] = _SH_CODES[sh[name]]
     return Splats(
         means=within(_BOUNDS, _fields(vertex["packed_position"], (21, 11), (11, 10), (0, 11))),
         quats=wxyz[:, [1, 2, 3, 0]],

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.files import whole_file
+from softmode.files import open_file, whole_file
 from softmode.splats.formats.common import check_count, exp_scales, read_exactly, sigmoid, unreadable
 from softmode.splats.formats.compressed_ply import decode_compressed
 from softmode.splats.splats import Splats
@@ -61,7 +61,7 @@ def read_ply(path: str | os.PathLike[str]) -> Splats:
         AssetError: If the file is no splat `.ply`, contradicts its header, or holds no usable splats.
     """
     file_path = Path(path)
-    with open(file_path, "rb") as file:
+    with open_file(file_path, "splat file") as file:
         elements, offset = _parse_header(file.read(_HEADER_LIMIT), str(file_path))
         names = [element.name for element in elements]
         if names not in (["vertex"], ["chunk", "vertex"], ["chunk", "vertex", "sh"]):

@@ -20,11 +20,14 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from softmode.errors import AssetError
+from softmode.files import open_file, open_zip, read_file
+from softmode.foreign.child.layers import inside
 from softmode.splats.formats.common import FREE_BYTES, MAX_RATIO, exp_scales, quats_from_smallest_three, unreadable
 from softmode.splats.splats import MAX_SPLATS, Splats
 
 _META_LIMIT = 16 * 1024 * 1024
 _IMAGE_FILE_LIMIT = 512 * 1024 * 1024
+_WHOLE = "Copy the whole folder, with all .webp files"
 _ARCHIVE_RATIO = 16
 """Largest ratio of unpacked to packed bytes of a large member of an archive; WebP images are packed already."""
 
@@ -44,7 +47,7 @@ def read_sog(path: str | os.PathLike[str]) -> Splats:
         return _decode(str(file), _folder_reader(file))
     if file.suffix.lower() == ".json":
         return _decode(str(file), _folder_reader(file.parent, file.name))
-    with zipfile.ZipFile(file) as archive:
+    with open_file(file, "splat file") as stream, open_zip(stream) as archive:
         return _decode(str(file), _archive_reader(archive, str(file)))
 
 
@@ -67,16 +70,12 @@ def _folder_reader(folder: Path, meta: str = "meta.json") -> _Reader:
     """Return a reader of the members of a SOG folder."""
 
     def read(name: str, limit: int) -> bytes:
-        file = folder / (meta if name == "meta.json" else name)
-        if not file.is_file():
-            raise unreadable(
-                folder / meta, f"member {name} is missing", hint="Copy the whole folder, with all .webp files"
-            )
-        with open(file, "rb") as stream:
-            data = stream.read(limit + 1)
-        if len(data) > limit:
-            raise unreadable(file, f"larger than {limit} bytes", hint="Decimate the asset first")
-        return data
+        if name == "meta.json":  # the file that was named, wherever it lies
+            return read_file(folder / meta, "splat file", limit=limit)
+        file = folder / name
+        if not inside(str(file), str(folder)):
+            raise unreadable(folder / meta, f"member {name} is a link that leads outside of its folder", hint=_WHOLE)
+        return read_file(file, f"splat file {folder / meta}: member", limit=limit, hint=_WHOLE)
 
     return read
 
@@ -219,7 +218,8 @@ def _decode(source: str, read: _Reader) -> Splats:
     color = pixels(meta["sh0"]["files"].files(1)[0])
     sh = meta["sh0"]["codebook"].numbers(256)[color[:, :3]][:, None]
     if "shN" in meta:
-        sh = np.concatenate([sh, _decode_palette(meta["shN"], pixels, image)], axis=1)
+        with np.errstate(over="ignore"):
+            sh = np.concatenate([sh.astype(np.float32), _decode_palette(meta["shN"], pixels, image)], axis=1)
     return Splats(
         means=means,
         quats=wxyz[:, [1, 2, 3, 0]],
@@ -232,7 +232,7 @@ def _decode(source: str, read: _Reader) -> Splats:
 
 def _decode_palette(
     meta: _SogMeta, pixels: Callable[[str], NDArray[np.uint8]], image: Callable[..., NDArray[np.uint8]]
-) -> NDArray[np.float64]:
+) -> NDArray[np.float32]:
     """Decode the higher spherical harmonics: one of up to 65536 palette entries per splat, 64 entries per image row."""
     coefficient_count = (meta["bands"].integer(1, 3) + 1) ** 2 - 1
     centroid_file, label_file = meta["files"].files(2)
@@ -242,4 +242,5 @@ def _decode_palette(
     if entry.max() >= 64 * len(palette):
         raise meta.fail(f"a splat names palette entry {entry.max()}, the palette holds {64 * len(palette)}")
     column = (entry % 64)[:, None] * coefficient_count + np.arange(coefficient_count)
-    return meta["codebook"].numbers(256)[palette[(entry // 64)[:, None], column][..., :3]]
+    codebook = meta["codebook"].numbers(256).astype(np.float32)
+    return codebook[palette[(entry // 64)[:, None], column][..., :3]]

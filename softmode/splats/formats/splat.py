@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from softmode.files import whole_file
+from softmode.files import open_file, whole_file
 from softmode.splats.formats.common import check_count, read_exactly, sh_from_colors, unreadable
 from softmode.splats.splats import SH_DC, Splats
 
@@ -25,7 +25,7 @@ def read_splat(path: str | os.PathLike[str]) -> Splats:
         AssetError: If its size is no multiple of 32 bytes, or it holds no usable splats.
     """
     file_path = Path(path)
-    with open(file_path, "rb") as file:
+    with open_file(file_path, "splat file") as file:
         size = os.fstat(file.fileno()).st_size
         if size % _RECORD.itemsize:
             raise unreadable(file_path, f"{size} bytes are no multiple of 32")

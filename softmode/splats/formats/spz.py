@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softmode.errors import ConfigError, MissingExtraError
-from softmode.files import whole_file
+from softmode.files import open_file, whole_file
 from softmode.splats.formats.common import (
     FREE_BYTES,
     MAX_RATIO,
@@ -77,7 +77,7 @@ def read_spz(path: str | os.PathLike[str]) -> Splats:
         MissingExtraError: If it is of version 4 and Zstandard is not installed (Python before 3.14).
     """
     file_path = Path(path)
-    with open(file_path, "rb") as file:
+    with open_file(file_path, "splat file") as file:
         data = read_exactly(file, os.fstat(file.fileno()).st_size, file_path)
     unpack = _unpack_gzip if data[:2] == b"\x1f\x8b" else _unpack_zstd
     return _decode(*unpack(data, str(file_path)), str(file_path))
@@ -196,7 +196,8 @@ def _decode(header: _Header, arrays: dict[str, Any], path: str) -> Splats:
     sh = ((table("colors", 3) / 255.0 - 0.5) / _DC_SCALE)[:, None]
     if header.degree:
         rest = table("sh", 3 * ((header.degree + 1) ** 2 - 1)).reshape(header.count, -1, 3)
-        sh = np.concatenate([sh, (rest[:, :15].astype(np.float64) - 128.0) / 128.0], axis=1)
+        steps = np.arange(-128.0, 128.0, dtype=np.float32) / np.float32(128.0)
+        sh = np.concatenate([sh.astype(np.float32), steps[rest[:, :15]]], axis=1)
     return Splats(
         means=means,
         quats=quats,
