@@ -70,9 +70,13 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def member(folder: Path, name: str) -> Path:
-    """Return a file of a dataset; raises AssetError if links lead out of its folder, or it is no file."""
-    path = folder / name
-    if not inside(str(path), str(folder)):
+    """Return a file of a dataset; raises AssetError if links lead out of its folder, or it is no file.
+
+    Hugging Face's cache has a dataset as `snapshots/REVISION` of links to the files in `blobs` beside `snapshots`.
+    """
+    path, home = folder / name, folder.absolute().parent
+    cached = home.name == "snapshots" and (home.parent / "blobs").is_dir()
+    if not inside(str(path), str(home.parent if cached else folder)):
         hint = "copy the dataset with its links followed, as cp -rL does"
         raise AssetError(f"{path} leads out of the dataset's folder", hint=hint)
     if path.exists() and not path.is_file():

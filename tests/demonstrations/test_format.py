@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 
 from softmode.demonstrations import read_dataset
+from softmode.errors import AssetError
 from tests.demonstrations.episodes import CAMERA, FPS, episode, features, write
 
 pq: Any = pytest.importorskip("pyarrow.parquet")
@@ -185,6 +186,23 @@ def test_tasks_table_is_a_frame_indexed_by_sentence(tmp_path: Path):
     table = pq.read_table(tmp_path / "d/meta/tasks.parquet")
     assert table.to_pydict() == {"task_index": [0, 1], "__index_level_0__": ["lift the toy", "push"]}
     assert json.loads(table.schema.metadata[b"pandas"])["index_columns"] == ["__index_level_0__"]
+
+
+def test_a_snapshot_of_hugging_face_is_read_and_its_links_stay_in_the_cache(tmp_path: Path):
+    """The cache has a dataset as links to blobs beside it; a link that leads out of both is refused."""
+    snapshot, blobs = tmp_path / "datasets--me--toy/snapshots/0a1b", tmp_path / "datasets--me--toy/blobs"
+    write(snapshot, (2,))
+    blobs.mkdir()
+    for number, path in enumerate(sorted(path for path in snapshot.rglob("*") if path.is_file())):
+        path.rename(blobs / str(number))
+        path.symlink_to(blobs / str(number))
+    assert read_dataset(snapshot).columns["action"].shape[0] == 2
+    info = snapshot / "meta/info.json"
+    info.resolve().rename(tmp_path / "info.json")
+    info.unlink()
+    info.symlink_to(tmp_path / "info.json")
+    with pytest.raises(AssetError, match="leads out of the dataset's folder"):
+        read_dataset(snapshot)
 
 
 def test_large_datasets_are_spread_over_files(tmp_path: Path):
