@@ -280,7 +280,7 @@ def test_a_ratio_that_varies() -> None:
 
 
 def test_a_ratio_far_from_the_build_is_named() -> None:
-    """A body made for 0.4 warns when it is added with 0.49; one made for it, or for two of which it is one, does not."""
+    """A body made for 0.4 warns when it is added with 0.49; one made for the ratio, or for it and another, does not."""
     with pytest.warns(RuntimeWarning, match=r"poissons_ratio=0.49"):
         add_reduced_body(newton.ModelBuilder(), built(), material=Material(poissons_ratio=0.49))
     with warnings.catch_warnings():
