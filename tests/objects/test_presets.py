@@ -226,7 +226,7 @@ def test_what_is_wide_but_has_a_narrow_part_fits(name: str) -> None:
 
 def test_what_does_not_fit_is_found_by_the_planner() -> None:
     """A box of 12 cm: the finding has the words and the remedy of the error with which the scripted policy ends."""
-    cube = load(shape="box", extents=(0.12, 0.12, 0.12), build=LiftSoftConfig().scene.object.build, surface_count=200)
+    cube = load(shape="box", extents=(0.12, 0.12, 0.12), build=LiftSoftConfig().scene.object.build)
     jaw = ParallelJaw.of(ArmDescription())
     (finding,) = cube.findings(jaw=jaw)
     with pytest.raises(GraspError) as caught:
