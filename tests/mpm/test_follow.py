@@ -54,7 +54,6 @@ def test_a_grid_that_follows_has_the_bits_of_a_large_one(speed: float) -> None:
     assert (followed.gradient_count, followed.trial_count) == (fixed.gradient_count, fixed.trial_count)
 
 
-@pytest.mark.rest
 def test_a_large_grid_of_other_origin_is_the_same_to_rounding() -> None:
     """Where the nodes of a large grid are counted from another origin positions differ by rounding alone."""
     _, followed = planned(SMALL, "follow", [TORUS], 8.0, precision="float64")
