@@ -48,10 +48,13 @@ class Recipe:
     options: BuildOptions
     regions: tuple[Region, ...] = ()
 
+    def integrate(self) -> Quadrature:
+        """Return the quadrature of the object."""
+        return self.shape(*self.of, point_count=self.points, surface_count=self.samples)
+
     def build(self) -> ReducedBody:
         """Build the body."""
-        quadrature = self.shape(*self.of, point_count=self.points, surface_count=self.samples)
-        return build_body(quadrature, self.options, name=self.name, regions=self.regions, progress=False)
+        return build_body(self.integrate(), self.options, name=self.name, regions=self.regions, progress=False)
 
 
 def kept(recipe: Callable[Given, Recipe]) -> Callable[Given, ReducedBody]:
@@ -122,6 +125,26 @@ def brick() -> Recipe:
     """Return a box of three different moments of inertia."""
     of = ((0.2, 0.12, 0.06),)
     return Recipe(name="brick", of=of, points=1000, samples=150, options=freeform(4, 150, 128))
+
+
+@kept
+def default_box() -> Recipe:
+    """Return a box of 6 x 5 x 4 cm as users get one, with the default options."""
+    return Recipe(name="box", of=((0.06, 0.05, 0.04),), points=4000, samples=800, options=BuildOptions())
+
+
+@kept
+def small_box() -> Recipe:
+    """Return the same box of few functions, points and samples."""
+    options = freeform(4, 120, 96)
+    return Recipe(name="box", of=((0.06, 0.05, 0.04),), points=1500, samples=200, options=options)
+
+
+@kept
+def quadratic_box() -> Recipe:
+    """Return a box of all functions of two quadratic handles."""
+    options = BuildOptions(mode_count=2, kernel_count=120, handles="quadratic", cubature_count=64)
+    return Recipe(name="quadratic box", of=((0.06, 0.05, 0.04),), points=1200, samples=40, options=options)
 
 
 @kept

@@ -1,21 +1,16 @@
-"""Attachments: held by a link or the world, two-way, released and held again, and the errors.
-
-Builds one cube with the default options, whose own samples are attached.
-"""
+"""Attachments: held by a link or the world, two-way, released and held again, and the errors."""
 
 import newton
 import numpy as np
 import pytest
 import warp as wp
 
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.quadrature import quadrature_from_box
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body
 from softmode.deformables.solver.attachments import attach
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from softmode.errors import ConfigError
-from tests.bodies import cube
+from tests.bodies import cube, default_box
 from tests.scenes import GRAVITY, Scene, add_free_box, rotation
 
 DOWN = (0.0, 0.0, -GRAVITY)
@@ -252,10 +247,10 @@ def test_errors():
 
 def test_own_surface_can_be_attached():
     """The surface samples of a body count as inside, also those in a corner that no kernel reaches; beyond them not."""
-    body = build_body(quadrature_from_box((1.0, 1.0, 1.0)), progress=False)
+    body = default_box()
     builder = newton.ModelBuilder()
     soft = add_reduced_body(builder, body)
     found = attach(builder, soft, body, points=body.surface_points)
     assert found.count == len(body.surface_points)
     with pytest.raises(ConfigError, match="1 of 1 points lie outside"):
-        attach(builder, soft, body, points=[[0.0, 0.0, 0.8]])
+        attach(builder, soft, body, points=[[0.0, 0.0, 0.05]])

@@ -29,6 +29,7 @@ from softmode.envs.tasks.shape_soft import config as shape_soft
 from softmode.errors import BasisError
 from softmode.objects import ObjectConfig, load, task_objects
 from softmode.objects.source import object_source
+from tests.bodies import RECIPES, sheet, slab, small_box
 from tests.marks import rest_but
 
 GOOD = {
@@ -54,13 +55,13 @@ def names(report: BodyReport, severity: str | None = None) -> set[str]:
 @pytest.fixture(scope="module")
 def quadrature() -> Quadrature:
     """Return a box."""
-    return quadrature_from_box((0.06, 0.05, 0.04), point_count=1500, surface_count=200)
+    return RECIPES["small_box"]().integrate()
 
 
 @pytest.fixture(scope="module")
-def body(quadrature: Quadrature) -> ReducedBody:
+def body() -> ReducedBody:
     """Return a good body."""
-    return build_body(quadrature, SMALL)
+    return small_box()
 
 
 def test_many_functions_are_noted(quadrature: Quadrature, body: ReducedBody) -> None:
@@ -148,6 +149,16 @@ def test_condition_numbers_are_those_of_dense_matrices() -> None:
     assert found[20] == np.inf
 
 
+def plate(size: tuple[float, float, float]) -> ReducedBody:
+    """Return a plate."""
+    return build_body(quadrature_from_box(size, point_count=1500, surface_count=400), SMALL)
+
+
+def beam(options: BuildOptions) -> ReducedBody:
+    """Return a beam 5:1."""
+    return build_body(quadrature_from_box((0.10, 0.02, 0.02), point_count=1500, surface_count=200), options)
+
+
 def two_spheres(gap: float) -> Quadrature:
     """Return two spheres of 2 cm radius with a gap between them."""
     ball = trimesh.creation.icosphere(3, 0.02)
@@ -169,21 +180,18 @@ def test_separate_parts_are_found(gap: float, found: set[str]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("size", "options", "found"),
+    ("make", "found"),
     [
-        ((0.10, 0.10, 0.0004), BuildOptions(mode_count=4), "thin"),
-        ((0.10, 0.02, 0.02), BuildOptions(mode_count=4), "slender"),
-        pytest.param(
-            *((0.10, 0.02, 0.02), BuildOptions(mode_count=4, handles="quadratic"), "slender"), marks=pytest.mark.rest
-        ),
+        (lambda: plate((0.10, 0.10, 0.0004)), "thin"),
+        (slab, "slender"),
+        pytest.param(lambda: beam(BuildOptions(mode_count=4)), "slender", marks=pytest.mark.rest),
+        pytest.param(lambda: beam(BuildOptions(mode_count=4, handles="quadratic")), "slender", marks=pytest.mark.rest),
     ],
+    ids=["sheet", "slab", "beam", "beam of quadratic handles"],
 )
-def test_thin_and_slender_bodies_are_told_what_to_do(
-    size: tuple[float, float, float], options: BuildOptions, found: str
-) -> None:
+def test_thin_and_slender_bodies_are_told_what_to_do(make: Callable[[], ReducedBody], found: str) -> None:
     """A sheet is no solid; a beam wants quadratic handles and a low rank tolerance."""
-    report = report_body(build_body(quadrature_from_box(size, point_count=1500), options))
-    assert found in names(report, "warning")
+    assert found in names(report_body(make()), "warning")
 
 
 @pytest.mark.rest
@@ -289,14 +297,10 @@ def test_what_matters_is_told(body: ReducedBody) -> None:
 
 
 def test_thin_walls_are_told() -> None:
-    """A plate of 1 mm has them, one of 3 mm none, unless it was filled on a grid too coarse to resolve it."""
-
-    def plate(thickness: float) -> ReducedBody:
-        return build_body(quadrature_from_box((0.06, 0.05, thickness), point_count=1500, surface_count=400), SMALL)
-
-    thin, thick = plate(0.001), plate(0.003)
+    """A plate of 1 mm has them, one of 4 mm none, unless it was filled on a grid too coarse to resolve it."""
+    thin, thick = plate((0.06, 0.05, 0.001)), sheet()
     assert "mm: they may come out" in (said := told(thin)["thin walls"]) and said.endswith("thicken them")
     assert report_body(thin).measure("surface that bounds thin walls") > 0.8
     assert not told(thick) and report_body(thick).measure("surface that bounds thin walls") == 0.0
-    coarse = replace(thick, provenance={**thick.provenance, "quadrature_voxel": 0.0015})
+    coarse = replace(thick, provenance={**thick.provenance, "quadrature_voxel": 0.002})
     assert told(coarse)["thin walls"].endswith("raise --resolution")

@@ -20,6 +20,7 @@ from softmode.deformables.build.quadrature import quadrature_from_box
 from softmode.deformables.build.reduced_stiffness import elastic_modes, reduced_stiffness
 from softmode.deformables.materials.material_kernels import MaterialModel
 from softmode.errors import BasisError, ConfigError
+from tests.bodies import RECIPES, cube, small_box
 from tests.reference import lame, stress
 
 LENGTH = 0.05
@@ -28,9 +29,8 @@ LENGTH = 0.05
 @pytest.fixture(scope="module")
 def full() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points, weights and basis gradients of a box on the full quadrature."""
-    quadrature = quadrature_from_box((0.06, 0.05, 0.04))
-    body = build_body(quadrature, BuildOptions(mode_count=8, cubature_count=None))
-    return quadrature.points, quadrature.weights, body.grad_basis.astype(np.float64)
+    quadrature, body = RECIPES["small_box"]().integrate(), small_box()
+    return quadrature.points, quadrature.weights, body.evaluate(quadrature.points - body.offset)[1]
 
 
 def reduced_force(weights: np.ndarray, grad_basis: np.ndarray, stretch: np.ndarray, q: np.ndarray) -> np.ndarray:
@@ -192,25 +192,31 @@ def test_all_points_and_bad_input(full) -> None:
 
 def test_points_end_where_the_fit_ends_in_rounding() -> None:
     """Few functions ask for few points: more than they need add none, and do not depend on how many were asked for."""
-    body = build_body(
-        quadrature_from_box((0.06, 0.05, 0.04), point_count=2000),
-        BuildOptions(function_count=12, kernel_count=100, cubature_count=None),
-    )
-    gradient = body.grad_basis.astype(np.float64)
-    found, again = (select_cubature(body.weights, gradient, count) for count in (600, 1200))
+    quadrature, body = RECIPES["cube"](mode_count=1).integrate(), cube(mode_count=1)
+    gradient = body.evaluate(quadrature.points - body.offset)[1]
+    found, again = (select_cubature(quadrature.weights, gradient, count) for count in (600, 900))
     assert len(found.index) < 600 and found.force_error < 3e-4
     np.testing.assert_array_equal(found.index, again.index)
     np.testing.assert_array_equal(found.weights, again.weights)
 
 
+def build(count: int, error: float | None) -> ReducedBody:
+    """Return a brick of so many cubature points, or more where forces err by more than asked for."""
+    quadrature = quadrature_from_box((0.1, 0.06, 0.03), point_count=1500, surface_count=100)
+    options = BuildOptions(kernel_count=150, cubature_count=count, cubature_error=error)
+    return build_body(quadrature, options, progress=False)
+
+
+@pytest.mark.rest
+def test_a_smaller_number_of_points_stays_and_what_cannot_be_reached_is_told() -> None:
+    """96 points are not made more; 768 that leave an error raise a warning."""
+    assert build(96, 1e-3).point_count == 96
+    with pytest.warns(RuntimeWarning, match="cubature_error: 768 points leave"):
+        build(384, 1e-6)
+
+
 def test_poses_and_points_are_added_where_forces_want_them() -> None:
-    """From 384 points on, more poses, then more points, until forces are right; a smaller number stays."""
-    quadrature = quadrature_from_box((0.1, 0.06, 0.03), point_count=1500)
-
-    def build(count: int, error: float | None) -> ReducedBody:
-        options = BuildOptions(kernel_count=150, cubature_count=count, cubature_error=error)
-        return build_body(quadrature, options, progress=False)
-
+    """From 384 points on, more poses, then more points, until forces are right."""
     asked = build(384, None)
     left = float(str(asked.provenance["cubature_force_error"]))
     more = build(384, 0.9 * left)
@@ -218,8 +224,5 @@ def test_poses_and_points_are_added_where_forces_want_them() -> None:
     assert float(str(more.provenance["cubature_force_error"])) <= 0.9 * left
     assert not (more.point_count == 384 and np.array_equal(more.points, asked.points))
     assert abs(more.weights.sum() / more.volume - 1.0) < 1e-12
-    assert build(96, left).point_count == 96
     with pytest.raises(ConfigError, match="cubature_error"):
         BuildOptions(cubature_error=0.0)
-    with pytest.warns(RuntimeWarning, match="cubature_error: 768 points leave"):
-        build(384, 1e-6)

@@ -312,6 +312,7 @@ END = Region(name="end", box=((-1.0, -1.0, -1.0), (-0.08, 1.0, 1.0)))
 def test_an_exact_region_goes_with_its_part(bar: ReducedBody) -> None:
     """It is not cut through, and the momentum of the held bar is that of the parts."""
     held = hold(bar, END)
+    assert held.function_count == bar.function_count == 24
     qd = motion(held)[1]
     parts = cut_body(held, MIDDLE).bodies
     assert [part.region_names for part in parts] == [("end",), ()]

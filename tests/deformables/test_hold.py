@@ -70,6 +70,7 @@ def test_is_the_body_that_was_told(free, held, quadrature, scales, tmp_path):
     assert told.provenance.keys() == again.provenance.keys()
 
 
+@pytest.mark.rest
 def test_a_number_of_functions_is_kept(quadrature):
     """A body of 24 functions chosen by elastic energy is held as one of 24."""
     options = BuildOptions(function_count=24, kernel_count=150)

@@ -139,13 +139,13 @@ def test_worlds_of_impacts_are_single_worlds():
 
 
 def test_stiff_pivots_are_not_indefinite():
-    """The Hessian of a cube of 1e9 Pa that has turned is definite: rounding does not pass for a negative pivot."""
+    """The Hessian of a cube of 3 cm and 1e9 Pa that has turned is definite: no rounding passes for a negative pivot."""
     scene = Scene(
-        lambda world: add_reduced_body(world, cube(0.03), material=Material(youngs_modulus=1.0e9)),
-        [cube(0.03)],
+        lambda world: add_reduced_body(world, cube(), material=Material(youngs_modulus=1.0e9), scale=0.3),
+        [cube()],
         dt=1.0 / 60.0,
     )
-    scene.set(q=cube(0.03).affine(rotation([1.0, 2.0, 2.0], 1.0)))
+    scene.set(q=cube().affine(0.3 * rotation([1.0, 2.0, 2.0], 1.0)))
     scene.step(3)
     assert not scene.reduced.tables.system.indefinite.numpy().any()
     assert not scene.reduced.status.numpy().any()

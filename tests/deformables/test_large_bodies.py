@@ -88,7 +88,7 @@ def test_points_in_chunks(device: str) -> None:
 
 
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("count", rest_but([200], [8, 24, 56, 88, 136, 200]))
+@pytest.mark.parametrize("count", rest_but([136], [8, 24, 56, 88, 136, 200]))
 def test_no_capacity_cliff(count: int, device: str) -> None:
     """Bodies from 24 to 600 unknowns bend alike, whichever launches their size calls for: 1e-5 of the size."""
     tips = []
@@ -127,8 +127,8 @@ def test_large_bodies_on_cuda(count: int) -> None:
 
 
 def test_slabs_of_points_keep_the_bits() -> None:
-    """However one thread cuts points, each entry has the same sums in the same order, here of 19 blocks."""
-    scene = scene_of(152)
+    """However one thread cuts points, each entry has the same sums in the same order, here of 17 blocks."""
+    scene = scene_of(136)
     scene.step(2)
     t, found = scene.reduced.tables, []
     t.newton.active.fill_(1)

@@ -51,12 +51,36 @@ def body() -> ReducedBody:
     return build_body(box(), OPTIONS, name="bar", progress=False)
 
 
-def test_weights_sum_to_one(body: ReducedBody) -> None:
+@functools.cache
+def fingers() -> Quadrature:
+    """Return the points of a hand."""
+    return quadrature_from_mesh(*SOLIDS["hand"]().surface(), point_count=3000, surface_count=200)
+
+
+@pytest.fixture(scope="module")
+def hand() -> ReducedBody:
+    """Return a hand of 24 local handles."""
+    options = BuildOptions(handles="local", local_count=24, function_count=24, cubature_count=32)
+    return build_body(fingers(), options, progress=False)
+
+
+@functools.cache
+def chosen(function_count: int) -> ReducedBody:
+    """Return the bar of so many functions of seven local handles."""
+    options = dataclasses.replace(OPTIONS, function_count=function_count, add_kernels=[TIP])
+    return build_body(box(), options, progress=False)
+
+
+@pytest.fixture(scope="module")
+def held() -> ReducedBody:
+    """Return the bar of 30 functions, held at one end after its build."""
+    return hold(chosen(30), END, progress=False)
+
+
+def test_weights_sum_to_one(body: ReducedBody, hand: ReducedBody) -> None:
     """Beside the constant handle: none is large or negative, all sum to one, and each of many vanishes somewhere."""
-    options = dataclasses.replace(OPTIONS, local_count=24, function_count=24)
-    more = build_body(box(), options, progress=False)
-    for one, count in ((body, 6), (more, 24)):
-        weight, gradient = one.skinning_weights(one.points)
+    for one, count in ((body, 6), (hand, 24)):
+        weight, gradient = one.skinning_weights(np.concatenate([one.points, one.surface_points]))
         assert weight.shape[1] == count + 1 and one.mode_count == count
         np.testing.assert_allclose(weight[:, 1:].sum(axis=1), 1.0, atol=1e-12)
         np.testing.assert_allclose(gradient[:, 1:].sum(axis=1), 0.0, atol=1e-9)
@@ -75,15 +99,12 @@ def test_functions_are_all_of_the_handles(body: ReducedBody) -> None:
     np.testing.assert_allclose(X + body.evaluate(X)[0] @ body.affine(A, t), X @ A.T + t, atol=1e-10 * SIZE[0])
 
 
-def test_handles_do_not_leak_to_the_next_finger() -> None:
+def test_handles_do_not_leak_to_the_next_finger(hand: ReducedBody) -> None:
     """The tips of two fingers share 1 % of their weights at most; bumps by straight lines, of Q-GMLS, share a third."""
-    solid = SOLIDS["hand"]()
-    quadrature = quadrature_from_mesh(*solid.surface(), point_count=3000)
+    solid, quadrature = SOLIDS["hand"](), fingers()
     width, _, height = solid.pitch
     tips = np.array([[0.5 * width, width, 8.5 * height], [2.5 * width, width, 8.5 * height]])
-    options = BuildOptions(handles="local", local_count=24, function_count=24, cubature_count=32)
-    local = build_body(quadrature, options, progress=False)
-    weight = np.abs(local.skinning_weights(tips - local.offset)[0][:, 1:])
+    weight = np.abs(hand.skinning_weights(tips - hand.offset)[0][:, 1:])
     straight = place_kernels(quadrature.points, quadrature.weights, 24, np.zeros((0, 4)), seed=0)
     away = np.linalg.norm(tips[:, None] - straight.centres, axis=2)
     bump = np.maximum(1.0 - (away / straight.radii) ** 2, 0.0) ** 3
@@ -103,9 +124,9 @@ def test_pull_of_a_held_cube() -> None:
     assert min(trial.gravity, trial.pull) > 0.95
 
 
-def test_regions_hold_exactly(body: ReducedBody) -> None:
+def test_regions_hold_exactly(held: ReducedBody) -> None:
     """Free functions vanish on an exact region, the others carry its affine motion."""
-    held = hold(body, END, progress=False)
+    body = chosen(30)
     inside = held.region_points
     assert np.abs(held.evaluate(inside)[0][:, held.driven_count :]).max() < 1e-9
     q, qd = carry_over(body, held, body.affine(2.0 * np.eye(3)), np.zeros((body.function_count, 3)))
@@ -129,20 +150,18 @@ def test_added_kernels_move_more_at_their_place(body: ReducedBody) -> None:
     assert here > 1.05 > 1.01 > there
 
 
-def test_functions_chosen_among_local_ones_are_nested(tmp_path) -> None:
+def test_functions_chosen_among_local_ones_are_nested(held: ReducedBody, tmp_path) -> None:
     """A number of functions takes them by elastic energy; a file and a late clamp keep the handles."""
-    quadrature = box()
-    options = dataclasses.replace(OPTIONS, function_count=30, add_kernels=[TIP])
-    few, many = (
-        build_body(quadrature, dataclasses.replace(options, function_count=n), progress=False) for n in (24, 30)
-    )
+    few, many = chosen(24), chosen(30)
     assert (few.function_count, many.function_count) == (24, 30)
     np.testing.assert_allclose(few.transform, many.transform[:, :24], atol=1e-8 * np.abs(few.transform).max())
     assert "space_error" not in few.provenance and float(str(few.provenance["frequency_error"])) < 0.05
     many.save(tmp_path / "bar.npz")
-    held = hold(ReducedBody.load(tmp_path / "bar.npz"), END, progress=False)
-    told = build_body(quadrature, options, regions=[END], progress=False)
-    assert held.fingerprint == told.fingerprint and np.array_equal(held.transform, told.transform)
+    read = hold(ReducedBody.load(tmp_path / "bar.npz"), END, progress=False)
+    options = dataclasses.replace(OPTIONS, function_count=30, add_kernels=[TIP])
+    told = build_body(box(), options, regions=[END], progress=False)
+    for one in (held, read):
+        assert one.fingerprint == told.fingerprint and np.array_equal(one.transform, told.transform)
 
 
 def test_cut_parts_keep_their_added_kernels() -> None:

@@ -9,7 +9,7 @@ from softmode.deformables.materials.material import Material
 from softmode.deformables.materials.material_kernels import MaterialModel
 from softmode.deformables.model.authoring import add_pins, add_reduced_body, drive_regions, register_custom_attributes
 from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
-from tests.bodies import bar, clamped, cube
+from tests.bodies import ball, bar, clamped, cube
 from tests.scenes import GRAVITY, Scene, rotation
 
 DOWN = (0.0, 0.0, -GRAVITY)
@@ -27,10 +27,10 @@ def free_world(world):
 
 
 def held_world(world):
-    """Add a clamped bar and, away from it, a larger cube with more modes."""
+    """Add a clamped bar and, away from it, a ball."""
     add_reduced_body(world, clamped(), material=Material(youngs_modulus=4.0e4, poissons_ratio=0.45))
     material = Material(youngs_modulus=2.0e5, model=MaterialModel.COROTATED)
-    add_reduced_body(world, cube(0.15, 6, 100), material=material, position=(1.0, 0.0, 0.5), velocity=(0.3, 0.0, 0.0))
+    add_reduced_body(world, ball(), material=material, position=(1.0, 0.0, 0.5), velocity=(0.3, 0.0, 0.0))
 
 
 def pinned_world(world):
@@ -45,7 +45,7 @@ INSTANCES = ((0,), (1, 2), (3,))
 
 def bodies():
     """Return every body of the worlds, in an order of its own."""
-    return [bar(), cube(0.15, 6, 100), clamped(), cube()]
+    return [bar(), ball(), clamped(), cube()]
 
 
 class MixedScene(Scene):

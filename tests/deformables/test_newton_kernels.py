@@ -18,6 +18,7 @@ from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from softmode.deformables.solver.step_tables import StepTables
 from softmode.envs.presets import RL_BUILD, RL_SOLVER, rl_scene
 from softmode.scenes.table_scene import TableScene, TableSceneConfig
+from tests.marks import rest_but
 
 CLOSE = np.array([0.0, 0.0, -1.0, 0.0, 1.0], np.float32)
 
@@ -127,13 +128,19 @@ def test_packed_system_grasps_as_the_launches_do() -> None:
     np.testing.assert_allclose(packed["force"], apart["force"], atol=1.0e-5 * np.abs(apart["force"]).max())
 
 
+@functools.cache
+def in_one_launch() -> dict[str, np.ndarray]:
+    """Return the grasp of the one launch alone."""
+    return grasp("cpu", one_launch=True)
+
+
 @pytest.mark.parametrize("rounds, room", [(1, 0), (40, 0), (40, 2)])
 def test_rounds_of_launches_grasp_as_the_one_launch_does(rounds: int, room: int) -> None:
     """Worlds go on in the one launch from wherever a round left them, end in the rounds, or go beside them.
 
     Sums have another order, and the one launch evaluates in lanes: both stop within 1e-3 of the forces.
     """
-    alone, after = (grasp("cpu", one_launch=True, rounds=count, room=room) for count in (0, rounds))
+    alone, after = in_one_launch(), grasp("cpu", one_launch=True, rounds=rounds, room=room)
     assert (after["aside"] == (room > 0)).all()
     for name in ("q", "joint_q"):
         np.testing.assert_allclose(after[name], alone[name], atol=1.0e-7)
@@ -206,15 +213,21 @@ def test_one_launch_on_cuda(shared: bool, rounds: int, room: int) -> None:
     np.testing.assert_allclose(at_once["force"], apart["force"], atol=1.0e-3 * np.abs(apart["force"]).max())
 
 
+SEARCH = ("search_kernels", ("check_iterates", "reuse_hessians"))
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="needs the CUDA compiler of Warp's wheel")
 @pytest.mark.parametrize(
-    "module, entries",
-    [
-        ("search_kernels", ("check_iterates", "reuse_hessians")),
-        ("assembly_kernels", ("assemble_matrix", "assemble_columns", "assemble_pins")),
-        ("tile_kernels", ("assemble_tiles",)),
-        ("newton_round_kernels", ("evaluate_trials", "differentiate_points", "assemble_stiffness")),
-    ],
+    ("module", "entries"),
+    rest_but(
+        [SEARCH],
+        [
+            SEARCH,
+            ("assembly_kernels", ("assemble_matrix", "assemble_columns", "assemble_pins")),
+            ("tile_kernels", ("assemble_tiles",)),
+            ("newton_round_kernels", ("evaluate_trials", "differentiate_points", "assemble_stiffness")),
+        ],
+    ),
 )
 def test_no_thread_copies_the_tables(module: str, entries: tuple[str, ...], tmp_path: Path) -> None:
     """Compiled for CUDA, no kernel has the 8 kB of the step's struct in its threads' own memory."""

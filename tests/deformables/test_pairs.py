@@ -456,9 +456,9 @@ def stack(count=3, **kw):
 
     def populate(world):
         for k in range(count):
-            add_reduced_body(world, cube(surface_count=300), position=(0.0, 0.0, 0.05 + k * (EDGE + RIGID_GAP)))
+            add_reduced_body(world, cube(), position=(0.0, 0.0, 0.05 + k * (EDGE + RIGID_GAP)))
 
-    return Scene(populate, [cube(surface_count=300)], gravity=DOWN, ground=0.8, **kw)
+    return Scene(populate, [cube()], gravity=DOWN, ground=0.8, **kw)
 
 
 def test_stack_carries_its_weight():
@@ -496,13 +496,11 @@ def soft_rigid_soft():
 
     def populate(world):
         material = Material(youngs_modulus=2.0e5)
-        add_reduced_body(world, cube(surface_count=300), material=material, position=(0.0, 0.0, 0.05))
+        add_reduced_body(world, cube(), material=material, position=(0.0, 0.0, 0.05))
         add_free_box(world, (0.05, 0.05, 0.03), 0.5, (0.0, 0.0, EDGE + 0.03 + RIGID_GAP))
-        add_reduced_body(
-            world, cube(surface_count=300), material=material, position=(0.0, 0.0, EDGE + 0.11 + 2 * RIGID_GAP)
-        )
+        add_reduced_body(world, cube(), material=material, position=(0.0, 0.0, EDGE + 0.11 + 2 * RIGID_GAP))
 
-    return Scene(populate, [cube(surface_count=300)], gravity=DOWN, ground=0.8, coupled=True)
+    return Scene(populate, [cube()], gravity=DOWN, ground=0.8, coupled=True)
 
 
 @pytest.mark.parametrize("time", [2.0, pytest.param(60.0, marks=pytest.mark.slow)])

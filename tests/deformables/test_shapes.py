@@ -5,8 +5,6 @@ Builds bodies of many shapes: the build has to stand all of them.
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 import trimesh
@@ -22,7 +20,7 @@ FAST = ("plate 40:1", "torus", "L-shape", "star", "helix", "letters on a rule", 
 SMALL = BuildOptions(mode_count=4, kernel_count=200, cubature_count=128)
 
 
-@pytest.mark.parametrize("name", rest_but(["torus", "plate 40:1", "letters on a rule"], FAST))
+@pytest.mark.parametrize("name", rest_but(["plate 40:1"], FAST))
 def test_small_build_meets_exact_moments(name: str) -> None:
     """Volume, centre and second moments of a build are the object's; M = mass * 1; nothing is NaN."""
     trial = try_build(SHAPES[name], SMALL, point_count=3000)
@@ -45,23 +43,19 @@ def test_meshes_are_closed(name: str) -> None:
     assert 0.5 <= np.ptp(mesh.vertices, axis=0).max() <= 1.05
 
 
-def test_pull_against_finite_elements() -> None:
-    """A cube held at its base: the work of the loads grows with the subspace, towards that of FEM and not past it."""
+@pytest.mark.parametrize(
+    ("static_responses", "gravity", "pull"), rest_but([(True, 0.97, 0.9)], [(True, 0.97, 0.9), (False, 0.8, 0.7)])
+)
+def test_pull_against_finite_elements(static_responses: bool, gravity: float, pull: float) -> None:
+    """A cube held at its base: the work of the loads is nearly that of FEM and not more, nearest with responses."""
     voxels = voxelise(SHAPES["cube"], 3)
     quadrature = voxels.quadrature(3000)
     loads = solve_reference(voxels, quadrature)
-    options = BuildOptions(mode_count=4, kernel_count=200, cubature_count=None)
-    trials = []
-    for change in ({"static_responses": False}, {}):
-        body = build_body(
-            quadrature, dataclasses.replace(options, **change), regions=(base_of(voxels),), progress=False
-        )
-        trials.append(try_pull("cube", voxels, loads, body))
-        assert not trials[-1].problems(), trials[-1]
-    few, more = trials
-    assert 0.8 < few.gravity < more.gravity
-    assert 0.7 < few.pull < more.pull
-    assert more.gravity > 0.97
+    options = BuildOptions(mode_count=4, kernel_count=200, cubature_count=None, static_responses=static_responses)
+    body = build_body(quadrature, options, regions=(base_of(voxels),), progress=False)
+    trial = try_pull("cube", voxels, loads, body)
+    assert not trial.problems(), trial
+    assert trial.gravity > gravity and trial.pull > pull
 
 
 def test_reference_agrees_with_a_column_under_its_own_weight() -> None:

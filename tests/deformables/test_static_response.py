@@ -26,6 +26,7 @@ from softmode.deformables.build.static_response import (
     solve_harmonic_weights,
     solve_static_responses,
 )
+from tests.bodies import RECIPES, quadratic_box
 
 INF = np.inf
 SIZE = np.array([0.4, 0.1, 0.1])
@@ -216,8 +217,7 @@ def test_response_derivatives_come_after_the_responses(quadrature: Quadrature) -
 
 def test_quadratic_handles_reproduce_quadratics() -> None:
     """With quadratic handles every polynomial of degree two is a combination of the functions, and n counts them."""
-    quadrature = quadrature_from_box((0.06, 0.05, 0.04), point_count=1200, surface_count=40)
-    body = build_body(quadrature, BuildOptions(mode_count=2, kernel_count=120, handles="quadratic", cubature_count=64))
+    quadrature, body = RECIPES["quadratic_box"]().integrate(), quadratic_box()
     assert 20 < body.function_count <= 30
     x = quadrature.points - body.offset
     value, gradient = body.evaluate(x)

@@ -29,6 +29,7 @@ from softmode.deformables.build.visibility import Material, divide_at_gaps, find
 from softmode.errors import AssetError, BasisError
 from softmode.files import write_archive
 from softmode.objects.primitives import scaled, turned
+from tests.bodies import brick
 from tests.marks import rest_but
 from tests.shapes import voxels
 
@@ -281,8 +282,7 @@ def test_file_round_trip(body: ReducedBody, slit: ReducedBody, tmp_path: Path) -
         loaded = ReducedBody.load(path)
         x = one.bounds[0] + np.random.default_rng(0).random((500, 3)) * np.ptp(one.bounds, axis=0)
         np.testing.assert_array_equal(one.evaluate(x)[0], loaded.evaluate(x)[0])
-    bar = build_body(integrate(np.ones((8, 2, 2), dtype=bool)), BuildOptions(function_count=20), progress=False)
-    bar.save(path)
+    brick().save(path)
     with np.load(path) as file:
         assert not {"material_points", "material_frame", "hidden_pairs", "detour_pairs", "detour_lengths"} & set(
             file.files

@@ -24,7 +24,7 @@ DEAR = {
     "README.md",
     *("docs/objects.md", "docs/usd.md", "docs/view.md", "docs/bodies.md", "docs/rerun.md", "docs/radiance.md"),
     *("docs/cutting.md", "docs/robots.md", "docs/howto/own_splat.md", "docs/howto/own_robot.md"),
-    "docs/howto/own_env.md",
+    *("docs/howto/own_env.md", "docs/gradients.md", "docs/deforming_splats.md"),
 }
 """Pages of 2 s and more whose snippets show at length what tests of their rooms show; they run with the rest."""
 

@@ -353,7 +353,7 @@ def test_every_object_is_built_for_a_ratio_that_varies() -> None:
     """Where Poisson's ratio is drawn, the toy's functions and the others' are made for several."""
     build = BuildOptions(function_count=12, kernel_count=60, cubature_count=48)
     scene = bin_scene()
-    first, *others = (replace(thing, build=build) for thing in (scene.object, *scene.others))
+    first, *others = (replace(thing, build=build) for thing in (scene.object, *scene.others[:1]))
     scene = replace(scene, object=first, others=tuple(others))
     env = PlaceInBinEnv(config=PlaceInBinConfig(scene=scene, poissons_ratio_range=(0.2, 0.45)))
     assert {thing.body.function_count for thing in env.scene.objects} == {15}

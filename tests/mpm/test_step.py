@@ -1,7 +1,4 @@
-"""A step of the material point method: identities, conservation, closed forms, bits.
-
-Builds one coarse box, since particles are made from what a body was built from.
-"""
+"""A step of the material point method: identities, conservation, closed forms, bits."""
 
 from __future__ import annotations
 
@@ -248,8 +245,8 @@ def test_particles_of_a_mesh_and_of_a_body_have_its_mass() -> None:
     """Masses sum to density times volume; a lattice of the paper has density times h^3 each, a point its own volume."""
     import trimesh
 
-    from softmode.deformables import BuildOptions, build_body, quadrature_from_box
     from softmode.deformables.build.sources import pack_sources, unpack_sources
+    from tests.bodies import RECIPES, brick
 
     mesh = trimesh.creation.icosphere(subdivisions=3, radius=2.0)
     found = particles_from_mesh(mesh.vertices, mesh.faces, spacing=0.25, material=MORPH_MATERIAL)
@@ -257,11 +254,10 @@ def test_particles_of_a_mesh_and_of_a_body_have_its_mass() -> None:
     assert np.linalg.norm(found.centre) < 0.05
     printed = particles_from_mesh(mesh.vertices, mesh.faces, spacing=0.25, material=MORPH_MATERIAL, exact=False)
     assert printed.masses == pytest.approx(75.0 * 0.25**3)
-    quadrature = quadrature_from_box((0.2, 0.1, 0.1), point_count=600)
-    body = build_body(quadrature, BuildOptions(mode_count=2, kernel_count=40, cubature_count=32), progress=False)
+    quadrature, body = RECIPES["brick"]().integrate(), brick()
     inside = particles_from_body(body, spacing=0.01, material=MORPH_MATERIAL)
-    assert inside.mass == pytest.approx(75.0 * 0.2 * 0.1 * 0.1, rel=1e-12)
-    assert inside.count == pytest.approx(2000, rel=0.2)
+    assert inside.mass == pytest.approx(75.0 * 0.2 * 0.12 * 0.06, rel=1e-12)
+    assert inside.count == pytest.approx(1440, rel=0.2)
     at_points = particles_from_body(body, material=MORPH_MATERIAL)
     assert at_points.masses == pytest.approx(75.0 * quadrature.weights, rel=1e-15)
     assert at_points.mass == pytest.approx(75.0 * quadrature.volume, rel=1e-12)

@@ -1,7 +1,4 @@
-"""Bodies, splats and states that the tests of the export share.
-
-Builds three bars of 48 points, one for each kind of handles that a stage can hold.
-"""
+"""Bodies, splats and states that the tests of the export share."""
 
 from __future__ import annotations
 
@@ -11,10 +8,6 @@ import functools
 import numpy as np
 
 from softmode.deformables.body.reduced_body import ReducedBody
-from softmode.deformables.body.regions import Region
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_box
 from softmode.deformables.materials.material import Material
 from softmode.deformables.materials.material_kernels import MaterialModel
 from softmode.splats import Splats
@@ -37,20 +30,17 @@ TURN = np.array([[0.0, -0.6, 0.8], [1.0, 0.0, 0.0], [0.0, 0.8, 0.6]])
 
 @functools.cache
 def small_body(kind: str) -> ReducedBody:
-    """Return a small bar with one kind of handles: affine, quadratic, or with a region and static responses."""
-    sizes = {"mode_count": 4, "kernel_count": 60, "cubature_count": 48}
-    handles = "quadratic" if kind == "quadratic" else "affine"
-    regions = [Region(name="root", box=((-1.0,) * 3, (-0.03, 1.0, 1.0)))] if kind == "regions" else []
-    quadrature = quadrature_from_box((0.1, 0.04, 0.03), surface_count=80)
-    return build_body(quadrature, BuildOptions(handles=handles, **sizes), regions=regions, name=f"bar {kind}")
+    """Return a small body with one kind of handles: affine, quadratic, or with a region and static responses."""
+    made = {"affine": lambda: bodies.two_modes(0.1), "quadratic": bodies.quadratic_box, "regions": bodies.clamped}
+    return dataclasses.replace(made[kind](), name=f"bar {kind}")
 
 
 def small_splats(coefficients: int = 1) -> Splats:
-    """Return splats in the bar."""
+    """Return splats in the bodies."""
     splats = random_splats(count=50, coefficients=coefficients)
     low, high = splats.bounds()
     inside = (splats.means - low) / (high - low) - 0.5
-    return dataclasses.replace(splats, means=inside * (0.1, 0.04, 0.03), scales=np.full((50, 3), (3e-3, 2e-3, 1e-3)))
+    return dataclasses.replace(splats, means=inside * (0.06, 0.04, 0.03), scales=np.full((50, 3), (3e-3, 2e-3, 1e-3)))
 
 
 def some_state(body: ReducedBody, seed: int = 7, scale: float = 1.0) -> np.ndarray:

@@ -38,7 +38,7 @@ from tests.usd.stages import KINDS, Author, Gf, Sdf, UsdGeom, UsdPhysics, UsdSha
 
 EPSILON = float(np.finfo(np.float32).eps)
 SMALL = BuildOptions(mode_count=3, kernel_count=120, cubature_count=128)
-FEW: dict[str, Any] = {"build_options": SMALL, "surface_count": 60}
+FEW: dict[str, Any] = {"build_options": SMALL, "surface_count": 100}
 """Options of a body that nobody looks at closely: samples of the surface take most of its build."""
 
 
@@ -80,7 +80,7 @@ def rigid_arrays(builder: newton.ModelBuilder) -> dict[str, np.ndarray]:
 def test_everything_in_a_stage(tmp_path: Path) -> None:
     """Robot and prop come through Newton, the soft bodies as reduced bodies; each once."""
     builder = newton.ModelBuilder()
-    found = add_usd(builder, everything(tmp_path / "a.usda"), build_options=SMALL, surface_count=100)
+    found = add_usd(builder, everything(tmp_path / "a.usda"), **FEW)
     assert list(found.bodies) == ["/World/Toy", "/World/Brick"]
     assert list(found.instances.values()) == [0, 1]
     assert set(found.newton["path_body_map"]) == {
@@ -107,7 +107,7 @@ def test_units_of_everything(tmp_path: Path, up: str, meters: float, kilograms: 
     models = []
     for name, units in (("si", ("Z", 1.0, 1.0)), ("other", (up, meters, kilograms))):
         builder = newton.ModelBuilder()
-        add_usd(builder, everything(tmp_path / f"{name}.usda", *units), build_options=SMALL, surface_count=100)
+        add_usd(builder, everything(tmp_path / f"{name}.usda", *units), **FEW)
         models.append(arrays(builder))
     for name, value in models[0].items():
         scale = np.abs(value[np.isfinite(value)]).max(initial=1e-12)
@@ -154,7 +154,7 @@ def test_what_moves_is_read_at_its_first_time(tmp_path: Path) -> None:
             op.Set((0.0, 0.0, height), code)
     author.save()
     builder = newton.ModelBuilder()
-    found = add_usd(builder, tmp_path / "a.usda", build_options=SMALL, surface_count=100)
+    found = add_usd(builder, tmp_path / "a.usda", **FEW)
     np.testing.assert_allclose(np.array(builder.body_q)[0, :3], (0.0, 0.0, 1.0), atol=EPSILON)
     np.testing.assert_allclose(found.bodies["/World/Toy"].position, (0.0, 0.0, 2.0), atol=1e-8)
 
@@ -173,7 +173,7 @@ def test_rotations_that_are_not_finite_are_refused(tmp_path: Path, time: float |
 def test_it_rests_on_the_ground(tmp_path: Path) -> None:
     """Two worlds of robot, prop and two soft bodies step with the coupled solver: the soft ones come to rest."""
     world = newton.ModelBuilder()
-    found = add_usd(world, everything(tmp_path / "a.usda"), build_options=SMALL, surface_count=100)
+    found = add_usd(world, everything(tmp_path / "a.usda"), **FEW)
     world.add_ground_plane()
     builder = newton.ModelBuilder()
     builder.replicate(world, 2)
@@ -214,11 +214,11 @@ def test_the_body_is_the_one_built_by_hand(tmp_path: Path) -> None:
     author.save()
     found = add_usd(newton.ModelBuilder(), tmp_path / "a.usda", **FEW)
     mesh, own = box(), dataclasses.replace(SMALL, poissons_ratio=found.bodies["/World/Toy"].material.poissons_ratio)
-    quadrature = quadrature_from_mesh(mesh.vertices.astype(np.float32), mesh.faces, surface_count=60)
+    quadrature = quadrature_from_mesh(mesh.vertices.astype(np.float32), mesh.faces, surface_count=100)
     assert own != SMALL
     assert found.bodies["/World/Toy"].body.fingerprint == build_body(quadrature, own, name="Toy").fingerprint
     splats = shell()
-    quadrature = quadrature_from_splats(splats.means, splats.scales, splats.quats, splats.opacities, surface_count=60)
+    quadrature = quadrature_from_splats(splats.means, splats.scales, splats.quats, splats.opacities, surface_count=100)
     assert found.bodies["/World/Plush"].body.fingerprint == build_body(quadrature, own, name="Plush").fingerprint
 
 
@@ -242,11 +242,11 @@ def test_what_the_stage_does_not_say(tmp_path: Path) -> None:
 def test_picture_from_a_visible_mesh(tmp_path: Path) -> None:
     """A body without splats is shown by samples of its visible meshes in their display colour."""
     author = Author.create(tmp_path / "a.usda")
-    author.body("/World/Toy", "TetMesh", matrix=transform((0.0, 0.0, 0.2), turn=0.3))
-    mesh = author.geometry("/World/Toy/Look", "Mesh")
+    author.body("/World/Brick", "TetMesh", matrix=transform((0.0, 0.0, 0.2), turn=0.3))
+    mesh = author.geometry("/World/Brick/Look", "Mesh")
     UsdGeom.Mesh(mesh).CreateDisplayColorAttr([(0.2, 0.4, 0.8)])
     author.save()
-    toy = add_usd(newton.ModelBuilder(), tmp_path / "a.usda", splat_count=500, **FEW).bodies["/World/Toy"]
+    toy = add_usd(newton.ModelBuilder(), tmp_path / "a.usda", splat_count=500, **FEW).bodies["/World/Brick"]
     assert toy.splats is not None and toy.splats.count == 500
     gamma = 1.055 * np.array([0.2, 0.4, 0.8]) ** (1 / 2.4) - 0.055
     np.testing.assert_allclose(toy.splats.colors(), np.tile(gamma, (500, 1)), atol=1e-5)
@@ -296,7 +296,7 @@ def test_refusals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ConfigError, match="up axis"):
         add_usd(newton.ModelBuilder(up_axis=newton.Axis.Y), path)
     with pytest.raises(ConfigError, match="no_such_option"):
-        add_usd(newton.ModelBuilder(), path, build_options=SMALL, newton_options={"no_such_option": 1})
+        add_usd(newton.ModelBuilder(), path, **FEW, newton_options={"no_such_option": 1})
     author = Author.create(tmp_path / "flat.usda")
     author.body("/World/Toy")
     points = author.stage.GetPrimAtPath("/World/Toy/Geometry").GetAttribute("points")
@@ -356,7 +356,7 @@ def cloth_and_sand(path: Path, meters: float = 1.0, kilograms: float = 1.0) -> P
     """Author a soft box, a cloth over it, and a heap of sand that a scene of Newton's material points owns."""
     author = Author.create(path, "Z", meters, kilograms)
     stage, pressure = author.stage, meters / kilograms
-    author.body("/World/Toy", "TetMesh", matrix=transform((0.0, 0.0, 0.035)))
+    author.body("/World/Brick", "TetMesh", matrix=transform((0.0, 0.0, 0.035)))
     weave = UsdShade.Material.Define(stage, "/World/Weave").GetPrim()
     weave.AddAppliedSchema("PhysicsSurfaceDeformableMaterialAPI")
     weave.CreateAttribute("physics:youngsModulus", Sdf.ValueTypeNames.Float).Set(1.0e5 * pressure)
@@ -397,11 +397,11 @@ def cloth_and_sand(path: Path, meters: float = 1.0, kilograms: float = 1.0) -> P
 def test_cloth_and_sand_are_left_to_newton(tmp_path: Path) -> None:
     """One cloth loses no stage and sand becomes no jelly: Newton has both, in any unit."""
     models = []
-    for meters, kilograms in ((1.0, 1.0), (0.01, 0.001)):
+    for meters, kilograms in ((1.0, 1.0), (0.001, 0.001)):
         path = cloth_and_sand(tmp_path / f"{meters}.usda", meters, kilograms)
         builder = newton.ModelBuilder()
-        found = add_usd(builder, path, build_options=SMALL, surface_count=100)
-        assert list(found.bodies) == ["/World/Toy"]
+        found = add_usd(builder, path, **FEW)
+        assert list(found.bodies) == ["/World/Brick"]
         left = [note for note in found.scene.notes if "left to Newton" in note]
         assert len(left) == 2 and "/World/Cloth: is cloth" in left[0] and "/World/Sand" in left[1]
         models.append((builder.finalize(), found))
@@ -421,7 +421,7 @@ def test_newton_steps_its_own_beside_the_toy(tmp_path: Path) -> None:
     from newton.solvers import SolverXPBD
 
     builder = newton.ModelBuilder()
-    found = add_usd(builder, cloth_and_sand(tmp_path / "a.usda"), build_options=SMALL, surface_count=100)
+    found = add_usd(builder, cloth_and_sand(tmp_path / "a.usda"), **FEW)
     model = builder.finalize()
     solver = SolverReduced(model, found.reduced_bodies)
     cloth, state, after = SolverXPBD(model), model.state(), model.state()
@@ -433,7 +433,7 @@ def test_newton_steps_its_own_beside_the_toy(tmp_path: Path) -> None:
     fallen = state.particle_q.numpy()[:, 2] - rest[:, 2]
     assert (fallen[:25] < 0.0).all() and (fallen[50:] < 0.0).all()
     single = newton.ModelBuilder()
-    found.bodies["/World/Toy"].add_to(single)
+    found.bodies["/World/Brick"].add_to(single)
     alone = single.finalize()
     lone, first, second = SolverReduced(alone, found.reduced_bodies), alone.state(), alone.state()
     for _ in range(4):
@@ -445,7 +445,7 @@ def test_newton_steps_its_own_beside_the_toy(tmp_path: Path) -> None:
 def test_which_deformables_are_taken(tmp_path: Path) -> None:
     """`only` and `skip` take paths and patterns; what is not taken is Newton's; what matches nothing is refused."""
     path = everything(tmp_path / "a.usda")
-    given = {"build_options": SMALL, "surface_count": 100}
+    given = FEW
     found = add_usd(newton.ModelBuilder(), path, only="/World/T*", **given)
     assert list(found.bodies) == ["/World/Toy"] and any(
         "/World/Brick: is not asked for" in n for n in found.scene.notes

@@ -10,10 +10,9 @@ import pytest
 
 pytest.importorskip("pxr", reason="needs the extra [usd]")
 
-from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.materials.material import Material
 from softmode.errors import AssetError, MaterialError
-from softmode.objects.stage_body import build_deformable
+from softmode.objects.stage_body import _integrate
 from softmode.usd import read_usd_scene
 from tests.usd.stages import EDGES, FAMILIES, KINDS, MATERIAL, Author, Sdf, UsdGeom, UsdShade, UsdVol, shell, transform
 
@@ -21,9 +20,6 @@ EPSILON = float(np.finfo(np.float32).eps)
 VOLUME = float(np.prod(EDGES))
 COARSE = {"Mesh": 1e-6, "TetMesh": 1e-6, "Points": 0.03, "ParticleField3DGaussianSplat": 0.08}
 """How near the volume comes: exactly but for float32, or by what a grid of 64 voxels fills of points and splats."""
-
-COARSE_BUILD = BuildOptions(mode_count=2, kernel_count=60, cubature_count=48)
-"""Volume and surface do not depend on the functions of a body."""
 
 
 def read_one(path: Path) -> Any:
@@ -43,10 +39,10 @@ def test_every_kind_and_family(tmp_path: Path, kind: str, family: str) -> None:
     assert (found.path, found.kind) == ("/World/Toy", kind)
     np.testing.assert_allclose(found.rotation, transform(turn=0.5)[:3, :3], atol=1e-12)
     np.testing.assert_allclose(found.translation, (0.1, 0.2, 0.3), atol=1e-12)
-    body = build_deformable(found, COARSE_BUILD, surface_count=60)
-    assert body.volume == pytest.approx(VOLUME, rel=COARSE[kind])
-    assert np.abs(body.offset).max() < 0.02 * min(EDGES)
-    material = found.material(body.volume)
+    shape = _integrate(found, 60)  # what its body is built from
+    assert shape.volume == pytest.approx(VOLUME, rel=COARSE[kind])
+    assert np.abs(shape.weights @ shape.points / shape.volume).max() < 0.02 * min(EDGES)
+    material = found.material(shape.volume)
     assert material.youngs_modulus == pytest.approx(MATERIAL["youngsModulus"], rel=EPSILON)
     assert material.poissons_ratio == pytest.approx(MATERIAL["poissonsRatio"], rel=EPSILON)
     assert material.density == pytest.approx(MATERIAL["density"], rel=EPSILON)
@@ -97,14 +93,14 @@ def test_stretched_and_mirrored(tmp_path: Path, kind: str) -> None:
     found = read_one(tmp_path / "a.usdc")
     whole = matrix @ shear
     assert np.linalg.det(found.rotation) == pytest.approx(1.0)
-    body = build_deformable(found, COARSE_BUILD, surface_count=100)
-    assert body.volume == pytest.approx(VOLUME * abs(np.linalg.det(whole[:3, :3])), rel=3 * COARSE[kind])
-    surface = body.surface_points + body.offset
-    world = surface @ found.rotation.T + found.translation
+    shape = _integrate(found, 100)
+    assert shape.volume == pytest.approx(VOLUME * abs(np.linalg.det(whole[:3, :3])), rel=3 * COARSE[kind])
+    world = shape.surface_points @ found.rotation.T + found.translation
     rest = np.linalg.solve(whole[:3, :3], (world - whole[:3, 3]).T).T
     beyond = np.abs(rest) / (0.5 * np.array(EDGES))
     assert np.abs(beyond.max(axis=1) - 1.0).max() < (1e-5 if kind in ("Mesh", "TetMesh") else 0.12), "on the box"
-    outwards = (body.surface_normals * body.surface_points).sum(axis=1)
+    centre = shape.weights @ shape.points / shape.volume
+    outwards = (shape.surface_normals * (shape.surface_points - centre)).sum(axis=1)
     assert (outwards > 0.0).all(), "a convex body's normals point away from its centre"
 
 
