@@ -28,9 +28,9 @@ from softmode.deformables.materials.material_kernels import (
     MaterialModel,
     MaterialParameters,
     determinant_minus_one,
-    energy,
+    energy_and_stress,
     lame,
-    stress,
+    needs_volume,
 )
 from softmode.deformables.model.declare import kernel_over
 from softmode.deformables.model.deformation_kernels import elastic_gradient
@@ -76,8 +76,6 @@ wp.set_module_options({"enable_backward": False})
 
 EXTRAPOLATION_INERTIA = wp.constant(wp.float64(0.01))
 """Least rho L^2 / (E dt^2) of a body whose acceleration is carried on."""
-NEEDS_FEASIBLE_START = wp.constant(int(MaterialModel.NEO_HOOKEAN))
-"""The material that forbids inversion: a step starts where the last one ended."""
 ENERGY_ROUNDING = wp.constant(wp.float64(2.0e-17))
 """What rounding leaves of the elastic energy of a body that has turned, over E V: a tenth of float64's unit, since the
 errors of its points differ in sign."""
@@ -182,7 +180,7 @@ def begin_step(
         c = wp.float64(1.5)
     # Newton starts from the motion that goes on; a material that forbids inversion wants a feasible start
     ahead = wp.float64(1.0)
-    if step.instances.material_model[i] == NEEDS_FEASIBLE_START:
+    if needs_volume(step.instances.material_model[i]):
         ahead = wp.float64(0.0)
     third = wp.float64(1.0) / wp.float64(3.0)
     for axis in range(3):
@@ -394,9 +392,10 @@ def evaluate_point(
     G_start = G
     if step.instances.viscosity[i] > 0.0:
         G_start = step.points.start[i, p]
-    step.points.energy[i, p] = s * s * weight * energy(parameters, G, G_start, dt)
+    psi, P = energy_and_stress(parameters, G, G_start, dt)
+    step.points.energy[i, p] = s * s * weight * psi
     if derivatives != ENERGIES:
-        step.points.stress[i, p] = s * weight * stress(parameters, G, G_start, dt)
+        step.points.stress[i, p] = s * weight * P
         step.points.volume_ratio[i, p] = float(wp.float64(1.0) + determinant_minus_one(G))
     if derivatives == ALL and step.state.refresh[w] != 0:
         C = float(weight) * hessian(parameters, G, G_start, dt, step.state.project[w])
