@@ -89,7 +89,7 @@ def _block(scaling: wp.mat33d, exchange: wp.mat33d, direct: wp.mat33d, V: wp.mat
 
 @wp.func
 def hooke_strain(material: MaterialParameters, G: wp.mat33d, G_start: wp.mat33d, dt: wp.float64):
-    """Return the strain that Hooke's law acts on, and its rate of change by E: E of STVK, tau/dt (E - E_n) of damping."""
+    """Return what Hooke's law acts on, E of STVK plus tau/dt (E - E_n) of damping, after its derivative by E."""
     strain = wp.mat33d()
     rate = wp.float64(0.0)
     if material.viscosity > wp.float64(0.0):
