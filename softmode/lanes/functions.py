@@ -12,7 +12,7 @@ from softmode.lanes.expressions import Expressions, Scope
 from softmode.lanes.native import IN_LANES, Law, Signature, Value, type_of
 
 
-def lanes_code(*functions: Any, uniform: Sequence[str] = ()) -> str:
+def lanes_code(*functions: Any, uniform: Sequence[str] = (), apart: Sequence[str] = ()) -> str:
     """Return C++ for the body of a native function: the types ``lanes`` and ``words``, and a struct ``Law``.
 
     Its static members are the device functions and all that they call. One with several results returns a struct with
@@ -21,11 +21,13 @@ def lanes_code(*functions: Any, uniform: Sequence[str] = ()) -> str:
     Args:
         functions: Functions of a point, made by ``wp.func``.
         uniform: Parameters and fields of structs, by name, of type float64 or bool that are the same for all lanes.
+        apart: Functions, by name, that are not compiled into those that call them, like those of
+            ``wp.func(inline=False)``: large ones that are seldom called compile in half of the time.
 
     Raises:
         LanesError: If a function uses what cannot be read, or its source is not there.
     """
-    law = Law(uniform, lambda law, function: Translation(law, function).write())
+    law = Law(uniform, apart, lambda law, function: Translation(law, function).write())
     for function in functions:
         law.signature(function)
     return law.code()
@@ -52,11 +54,11 @@ class Translation(Expressions):
         if len(kinds) > 1:
             members = " ".join(f"{type_of(kind)} _{k};" for k, kind in enumerate(kinds))
             self.law.members.append(f"        struct {out} {{ {members} }};\n")
-        inline = "noinline" if getattr(self.function, "inline_hint", None) == "noinline" else "always_inline"
+        apart = name in self.law.apart or getattr(self.function, "inline_hint", None) == "noinline"
         codes = ", ".join(value.code for value in results)
         body = [*self.scope.lines, f"return {codes};" if len(kinds) == 1 else f"return {{{codes}}};"]
         text = "".join(f"            {line}\n" for line in ("#pragma clang fp contract(fast)", *body))
-        head = f"        __attribute__(({inline})) static {out} {name}({given})"
+        head = f"        __attribute__(({'noinline' if apart else 'always_inline'})) static {out} {name}({given})"
         self.law.members.append(f"{head} {{\n{text}        }}\n")
         return [value.kind for value in parameters], kinds
 

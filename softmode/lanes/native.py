@@ -90,12 +90,13 @@ class Law:
 
     Args:
         uniform: Parameters and fields, by name, that are the same for all lanes.
+        apart: Functions, by name, that are compiled out of line.
         write: Translates a function, adds it to the members, and returns its signature.
     """
 
-    def __init__(self, uniform: Sequence[str], write: Callable[[Law, Any], Signature]) -> None:
+    def __init__(self, uniform: Sequence[str], apart: Sequence[str], write: Callable[[Law, Any], Signature]) -> None:
         """Nothing is written yet."""
-        self.uniform = uniform
+        self.uniform, self.apart = uniform, apart
         self.helpers: dict[str, str] = {}
         self.members: list[str] = []
         self.structs: dict[str, dict[str, str]] = {}

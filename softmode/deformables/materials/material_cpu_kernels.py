@@ -34,10 +34,11 @@ _LOADS = """
     __builtin_memcpy(&start, &G_start, sizeof(start));
 """
 _SAME = "viscosity", "dt"
+_APART = "hessian_of_invariants", "singular_values", "principal_hessian", "positive_part", "_block"
 
 
 @wp.func_native(
-    snippet=f"""{{{lanes_code(of_a_point, determinant_minus_one, uniform=_SAME)}{_LOADS}
+    snippet=f"""{{{lanes_code(of_a_point, determinant_minus_one, uniform=_SAME, apart=_APART)}{_LOADS}
     const Law::energy_and_stress_results found = Law::energy_and_stress(material, G, start, 1.0);
     const lanes J = 1.0 + Law::determinant_minus_one(G);
     wp::mat_t<11, 8, wp::float64> out;
@@ -64,7 +65,7 @@ def energy_and_stress(
 
 
 @wp.func_native(
-    snippet=f"""{{{lanes_code(hessian, uniform=_SAME)}{_LOADS}
+    snippet=f"""{{{lanes_code(hessian, uniform=_SAME, apart=_APART)}{_LOADS}
     typedef float floats __attribute__((ext_vector_type({LANES})));
     const wp::mat_t<18, 3, lanes> C = Law::hessian(material, G, start, 1.0, project);
     wp::mat_t<54, 8, float> out;
