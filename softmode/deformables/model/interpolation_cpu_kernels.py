@@ -69,8 +69,8 @@ SUMS = """
     };
 """
 """Native code. ``of``: the sums over the lanes of eight vectors, one in each lane. ``rows``: sum_k b_k q_k of eight
-rows, one in each lane, or sum_k b_k (q_k - from_k). The rows are at ``where``, their blocks of functions ``by_block``
-bytes apart; the axes of q are ``stride`` blocks apart, or with 0 the vectors of its functions follow each other."""
+rows, one in each lane, or sum_k b_k (q_k - from_k). It takes where the rows are, how many bytes apart the blocks of
+their functions, the coordinates, and how many blocks apart their axes; 0 where vectors of functions follow each other."""
 
 
 @wp.func_native(
