@@ -70,7 +70,7 @@ SUMS = """
 """
 """Native code. ``of``: the sums over the lanes of eight vectors, one in each lane. ``rows``: sum_k b_k q_k of eight
 rows, one in each lane, or sum_k b_k (q_k - from_k). It takes where the rows are, how many bytes apart the blocks of
-their functions, the coordinates, and how many blocks apart their axes; 0 where vectors of functions follow each other."""
+their functions are, the coordinates, and how many blocks apart their axes; 0 where each function has a vector."""
 
 
 @wp.func_native(
