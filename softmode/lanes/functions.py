@@ -78,8 +78,8 @@ class Translation(Expressions):
                 return self.block(sides[not test.number] + rest)
             if any(isinstance(node, ast.Return) for node in ast.walk(statement)):
                 sides = [side if side and isinstance(side[-1], ast.Return) else side + rest for side in sides]
-                return self.branch(test, *sides, statement)
-            self.branch(test, *sides, statement)
+                return self.branch(test, sides, statement)
+            self.branch(test, sides, statement)
         return None
 
     def inside(self, statements: list[ast.stmt]) -> tuple[Scope, list[Value] | None]:
@@ -89,11 +89,12 @@ class Translation(Expressions):
         inner, self.scope = self.scope, outer
         return inner, results
 
-    def branch(self, test: Value, yes: list[ast.stmt], no: list[ast.stmt], node: ast.If) -> list[Value] | None:
+    def branch(self, test: Value, given: list[list[ast.stmt]], node: ast.If) -> list[Value] | None:
         """Write both sides of a branch, and what of each becomes of the variables, or of the results."""
         if test.kind not in ("mask", "bool"):
             raise self.refused(node, "decides by what is no bool", "compare it with a number")
         per_lane, condition = test.kind == "mask", self.let(test).code
+        yes, no = given
         (first, one), (second, other) = self.inside(yes), self.inside(no)
         a, b = first.env, second.env
         if one is not None or other is not None:
