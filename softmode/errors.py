@@ -49,6 +49,10 @@ class GraspError(SoftmodeError, ValueError):
     """A gripper has no grasp of an object."""
 
 
+class LanesError(SoftmodeError, TypeError):
+    """A device function cannot be translated into code for eight points at a time, which CPUs run."""
+
+
 class MissingExtraError(SoftmodeError, ImportError):
     """An optional dependency is absent."""
 

@@ -67,6 +67,10 @@ def rotation_derivative(F: np.ndarray) -> np.ndarray:
     return -np.einsum("...in,njm,...mkl->...ijkl", R, LEVI_CIVITA, w)
 
 
+WITH_ROTATION = MaterialModel.ARAP, MaterialModel.COROTATED
+"""Models with the term mu |F - R|^2."""
+
+
 def _invariant_slopes(model: MaterialModel, ic: np.ndarray, j: np.ndarray, mu: float, lam: float) -> tuple[Any, ...]:
     """Return Psi and its derivatives (Psi_I, Psi_II, Psi_J, Psi_JJ) of the part that depends on I_C and J."""
     if model == MaterialModel.STABLE_NEO_HOOKEAN:
@@ -91,7 +95,7 @@ def _invariant_slopes(model: MaterialModel, ic: np.ndarray, j: np.ndarray, mu: f
 def energy(model: MaterialModel, F: np.ndarray, mu: float, lam: float) -> np.ndarray:
     """Return Psi(F) [J/m^3]."""
     psi = _invariant_slopes(model, (F * F).sum(axis=(-2, -1)), np.linalg.det(F), mu, lam)[0]
-    if model in (MaterialModel.ARAP, MaterialModel.COROTATED):
+    if model in WITH_ROTATION:
         psi = psi + mu * ((F - rotation(F)) ** 2).sum(axis=(-2, -1))
     if model == MaterialModel.STVK:
         E = green_strain(F)
@@ -104,7 +108,7 @@ def stress(model: MaterialModel, F: np.ndarray, mu: float, lam: float) -> np.nda
     shape = (..., None, None)
     _, d_i, _, d_j, _ = _invariant_slopes(model, (F * F).sum(axis=(-2, -1))[shape], np.linalg.det(F)[shape], mu, lam)
     P = 2 * d_i * F + d_j * cofactor(F)
-    if model in (MaterialModel.ARAP, MaterialModel.COROTATED):
+    if model in WITH_ROTATION:
         P = P + 2 * mu * (F - rotation(F))
     if model == MaterialModel.STVK:
         P = F @ hooke_stress(green_strain(F), mu, lam)
@@ -125,7 +129,7 @@ def hessian(model: MaterialModel, F: np.ndarray, mu: float, lam: float) -> np.nd
         + d_jj * np.einsum("...ij,...kl->...ijkl", g, g)
         + d_j * cofactor_derivative(F)
     )
-    if model in (MaterialModel.ARAP, MaterialModel.COROTATED):
+    if model in WITH_ROTATION:
         H = H + 2 * mu * (identity - rotation_derivative(F))
     if model == MaterialModel.STVK:
         turning = np.einsum("ik,...lj->...ijkl", I3, hooke_stress(green_strain(F), mu, lam))

@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parents[1]
 FLOORS = (
     "softmode errors",
     "leftovers interrupts",
-    "files checks lazy pause quiet versions",
+    "files checks lanes lazy pause quiet versions",
     "deformables foreign",
     "splats robots mpm",
     "radiance",

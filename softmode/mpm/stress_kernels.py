@@ -4,13 +4,14 @@ from typing import Any
 
 import warp as wp
 
-from softmode.deformables.materials.hessian_kernels import cofactor_derivative, stress_derivative
+from softmode.deformables.materials.hessian_kernels import invariant_stress_derivative, stress_derivative
 from softmode.deformables.materials.material_kernels import (
-    MaterialModel,
     MaterialParameters,
     cofactor,
+    determinant_minus_one,
     has_rotation,
-    hooke_lambda,
+    invariant_derivatives,
+    strain_measure,
     stress,
 )
 
@@ -62,11 +63,11 @@ def _is_rotation(R: wp.mat33d):
 @wp.func
 def first_piola(material: MaterialParameters, F: wp.mat33d, R: wp.mat33d):
     """Return the first Piola-Kirchhoff stress P [Pa] at F, R from :func:`polar_rotation`."""
-    I = wp.identity(n=3, dtype=wp.float64)
+    G = F - wp.identity(n=3, dtype=wp.float64)
     if _is_rotation(R):
-        p = hooke_lambda(material) * (wp.determinant(F) - wp.float64(1.0))
-        return (wp.float64(2.0) * material.mu) * (F - R) + p * cofactor(F)
-    return stress(material, F - I, wp.mat33d(), wp.float64(1.0))
+        _rest, s, _b, p, _l = invariant_derivatives(material, strain_measure(G), determinant_minus_one(G))
+        return (wp.float64(2.0) * material.mu) * (F - R) + s * F + p * cofactor(F)
+    return stress(material, G, wp.mat33d(), wp.float64(1.0))
 
 
 @wp.func
@@ -84,37 +85,24 @@ def kirchhoff_adjoint(model: int, mu: Any, lam: Any, F: Any, R: wp.mat33d, bar: 
     derivative of the rotation is dR = R skew(K^-1 v), K = tr(S) I - S with F = R S, v the axial vector of R^T dF.
     """
     one = wp.float64(1.0)
-    two = wp.float64(2.0)
+    zero = wp.float64(0.0)
     Fd = wp.mat33d(F)
     b = wp.mat33d(bar)
     bF = b * Fd
     m = _material(model, wp.float64(mu), wp.float64(lam))
     I = wp.identity(n=3, dtype=wp.float64)
+    P_mu = first_piola(_material(model, one, zero), Fd, R)
+    P_lam = first_piola(_material(model, zero, one), Fd, R)
+    H = wp.mat33d()
     if _is_rotation(R):
         S = wp.transpose(R) * Fd
         A = wp.transpose(R) * bF
         v = wp.inverse(wp.trace(S) * I - S) * wp.vec3d(A[2, 1] - A[1, 2], A[0, 2] - A[2, 0], A[1, 0] - A[0, 1])
-        volume = wp.determinant(Fd) - one
-        c = cofactor(Fd)
-        l = hooke_lambda(m)
-        P_mu = two * (Fd - R)
-        P_lam = volume * c
-        P = m.mu * P_mu + l * P_lam
-        H = (two * m.mu) * (bF - R * wp.skew(v)) + l * (wp.ddot(c, bF) * c + volume * cofactor_derivative(Fd, bF))
-        by_lam = wp.ddot(bF, P_lam)
-        if model == int(MaterialModel.ARAP):
-            by_lam = wp.float64(0.0)
-        return (
-            type(F)(H + wp.transpose(b) * P),
-            type(mu)(wp.ddot(bF, P_mu)),
-            type(mu)(by_lam),
-        )
-    P_mu = first_piola(_material(model, one, wp.float64(0.0)), Fd, R)
-    P_lam = first_piola(_material(model, wp.float64(0.0), one), Fd, R)
-    P = m.mu * P_mu + m.lam * P_lam
-    H = stress_derivative(m, Fd - I, wp.mat33d(), one, bF)
+        H = (wp.float64(2.0) * m.mu) * (bF - R * wp.skew(v)) + invariant_stress_derivative(m, Fd - I, bF)
+    else:
+        H = stress_derivative(m, Fd - I, wp.mat33d(), one, bF)
     return (
-        type(F)(H + wp.transpose(b) * P),
+        type(F)(H + wp.transpose(b) * (m.mu * P_mu + m.lam * P_lam)),
         type(mu)(wp.ddot(bF, P_mu)),
         type(mu)(wp.ddot(bF, P_lam)),
     )

@@ -84,7 +84,60 @@ def _block(scaling: wp.mat33d, exchange: wp.mat33d, direct: wp.mat33d, V: wp.mat
     """
     M = wp.cw_mul(scaling, wp.outer(u, w)) + wp.cw_mul(exchange, wp.outer(w, u))
     M += wp.diag(wp.transpose(direct) * wp.cw_mul(u, w))
-    return wp.mat33(V * M * wp.transpose(V))
+    return V * M * wp.transpose(V)
+
+
+@wp.func
+def hooke_strain(material: MaterialParameters, G: wp.mat33d, G_start: wp.mat33d, dt: wp.float64):
+    """Return what Hooke's law acts on, E of STVK plus tau/dt (E - E_n) of damping, after its derivative by E."""
+    strain = wp.mat33d()
+    rate = wp.float64(0.0)
+    if material.viscosity > wp.float64(0.0):
+        rate = material.viscosity / dt
+        strain = rate * (green_strain(G) - green_strain(G_start))
+    if material.model == int(MaterialModel.STVK):
+        rate += wp.float64(1.0)
+        strain += green_strain(G)
+    return rate, strain
+
+
+@wp.func
+def hessian_of_invariants(material: MaterialParameters, G: wp.mat33d, G_start: wp.mat33d, dt: wp.float64):
+    """Return the Hessian of an energy in the invariants of F [Pa], not projected: a polynomial in F and cof F.
+
+    Block C_cd has the entries d2Psi / dF_ci dF_dj. A strain's S = 2 mu E + lambda tr(E) I, times a rate, adds
+    S_ij delta_cd + lambda F_ci F_dj + mu (F_cj F_di + (F F^T)_cd delta_ij).
+    """
+    F = wp.identity(n=3, dtype=wp.float64) + G
+    cof = cofactor(F)
+    B = F * wp.transpose(F)
+    _rest, s, b, p, l = invariant_derivatives(material, strain_measure(G), determinant_minus_one(G))
+    rate, strain = hooke_strain(material, G, G_start, dt)
+    S = hooke_stress(material, strain)
+    m = rate * material.mu
+    b += rate * hooke_lambda(material)
+    C = HessianBlocks()
+    row = int(0)
+    for c in range(3):
+        for d in range(c, 3):
+            for i in range(3):
+                for j in range(3):
+                    entry = b * F[c, i] * F[d, j] + l * cof[c, i] * cof[d, j] + m * F[c, j] * F[d, i]
+                    if i == j:
+                        entry += m * B[c, d]
+                    if c == d:
+                        entry += S[i, j]
+                    if c == d and i == j:
+                        entry += s
+                    # p dcof/dF: the sign is that of the permutation (c, d, e) times that of (i, j, k)
+                    if c != d and i != j:
+                        if (d - c + 3) % 3 == (j - i + 3) % 3:
+                            entry += p * F[3 - c - d, 3 - i - j]
+                        else:
+                            entry -= p * F[3 - c - d, 3 - i - j]
+                    C[3 * row + i, j] = float(entry)
+            row += 1
+    return C
 
 
 @wp.func
@@ -101,6 +154,8 @@ def hessian(material: MaterialParameters, G: wp.mat33d, G_start: wp.mat33d, dt: 
     """
     zero = wp.float64(0.0)
     half = wp.float64(0.5)
+    if project == 0 and not has_rotation(material.model):
+        return hessian_of_invariants(material, G, G_start, dt)
     U, sigma, V = singular_values(wp.identity(n=3, dtype=wp.float64) + G)
     twist, flip, S = principal_hessian(material, G, sigma)
     if project != 0:
@@ -111,21 +166,21 @@ def hessian(material: MaterialParameters, G: wp.mat33d, G_start: wp.mat33d, dt: 
     odd = half * (flip - twist)
     direct = wp.mat33d(zero, even[2], even[1], even[2], zero, even[0], even[1], even[0], zero)
     exchange = wp.mat33d(zero, odd[2], odd[1], odd[2], zero, odd[0], odd[1], odd[0], zero)
+    viscous = wp.mat33d()
     if material.viscosity > zero:
         # F (2 m sym(F^T dF) + n tr(F^T dF) I), F diagonal: m (sigma_i^2 D_ij + sigma_i sigma_j D_ji) + n sigma_i tr.
         m = material.viscosity / dt * material.mu
         n = material.viscosity / dt * hooke_lambda(material)
         products = wp.outer(sigma, sigma)
         S += n * products
+        exchange += m * products
         for i in range(3):
             for j in range(3):
-                exchange[i, j] = exchange[i, j] + m * products[i, j]
                 direct[i, j] = direct[i, j] + m * products[i, i]
-    viscous = wp.mat33()
-    if project == 0 and material.viscosity > zero:
-        # the stress F S of the viscous S changes by dF S too
-        rate = green_strain(G) - green_strain(G_start)
-        viscous = wp.mat33(hooke_stress(material, material.viscosity / dt * rate))
+        if project == 0:
+            # the stress F S of the viscous S changes by dF S too
+            rate = green_strain(G) - green_strain(G_start)
+            viscous = hooke_stress(material, material.viscosity / dt * rate)
     C = HessianBlocks()
     row = int(0)
     for c in range(3):
@@ -133,11 +188,11 @@ def hessian(material: MaterialParameters, G: wp.mat33d, G_start: wp.mat33d, dt: 
             u = wp.vec3d(U[c, 0], U[c, 1], U[c, 2])
             w = wp.vec3d(U[d, 0], U[d, 1], U[d, 2])
             block = _block(S, exchange, direct, V, u, w)
+            if c == d:
+                block += viscous
             for a in range(3):
                 for b in range(3):
-                    C[3 * row + a, b] = block[a, b]
-                    if c == d:
-                        C[3 * row + a, b] = C[3 * row + a, b] + viscous[a, b]
+                    C[3 * row + a, b] = float(block[a, b])
             row += 1
     return C
 
@@ -151,12 +206,19 @@ def cofactor_derivative(F: wp.mat33d, dF: wp.mat33d):
 
 
 @wp.func
-def stress_derivative(material: MaterialParameters, G: wp.mat33d, G_start: wp.mat33d, dt: wp.float64, dF: wp.mat33d):
-    """Return dP[dF] [Pa], the derivative of :func:`.material_kernels.stress`, not projected."""
+def invariant_stress_derivative(material: MaterialParameters, G: wp.mat33d, dF: wp.mat33d):
+    """Return what an energy's part in the invariants of F has of :func:`stress_derivative` [Pa]."""
     F = wp.identity(n=3, dtype=wp.float64) + G
     _rest, s, b, p, l = invariant_derivatives(material, strain_measure(G), determinant_minus_one(G))
     cof = cofactor(F)
-    dP = s * dF + b * wp.ddot(F, dF) * F + l * wp.ddot(cof, dF) * cof + p * cofactor_derivative(F, dF)
+    return s * dF + b * wp.ddot(F, dF) * F + l * wp.ddot(cof, dF) * cof + p * cofactor_derivative(F, dF)
+
+
+@wp.func
+def stress_derivative(material: MaterialParameters, G: wp.mat33d, G_start: wp.mat33d, dt: wp.float64, dF: wp.mat33d):
+    """Return dP[dF] [Pa], the derivative of :func:`.material_kernels.stress`, not projected."""
+    F = wp.identity(n=3, dtype=wp.float64) + G
+    dP = invariant_stress_derivative(material, G, dF)
     if has_rotation(material.model):
         # dR = U W V^T with W_ij = (D_ij - D_ji) / (sigma_i + sigma_j), D = U^T dF V.
         U, sigma, V = singular_values(F)
@@ -167,13 +229,6 @@ def stress_derivative(material: MaterialParameters, G: wp.mat33d, G_start: wp.ma
                 if i != j:
                     W[i, j] = (D[i, j] - D[j, i]) / (sigma[i] + sigma[j])
         dP += wp.float64(2.0) * material.mu * (dF - U * W * wp.transpose(V))
-    strain = wp.mat33d()
-    rate = wp.float64(0.0)
-    if material.viscosity > wp.float64(0.0):
-        rate = material.viscosity / dt
-        strain += rate * (green_strain(G) - green_strain(G_start))
-    if material.model == int(MaterialModel.STVK):
-        rate += wp.float64(1.0)
-        strain += green_strain(G)
+    rate, strain = hooke_strain(material, G, G_start, dt)
     dE = wp.float64(0.5) * (wp.transpose(F) * dF + wp.transpose(dF) * F)
     return dP + dF * hooke_stress(material, strain) + rate * F * hooke_stress(material, dE)

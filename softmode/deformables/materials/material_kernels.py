@@ -64,6 +64,12 @@ def has_rotation(model: int):
 
 
 @wp.func
+def needs_volume(model: int):
+    """Return whether the energy is infinite at J <= 0: a state then has to start with J > 0 everywhere."""
+    return model == int(MaterialModel.NEO_HOOKEAN)
+
+
+@wp.func
 def hooke_lambda(material: MaterialParameters):
     """Return the lambda [Pa] of Hooke's law that the model obeys at small strain: 0 for ARAP."""
     if material.model == int(MaterialModel.ARAP):
@@ -229,8 +235,10 @@ def stretch_minus_one(E: wp.mat33d, sigma: wp.vec3d, V: wp.mat33d):
 
 
 @wp.func
-def energy(material: MaterialParameters, G: wp.mat33d, G_start: wp.mat33d, dt: wp.float64):
-    """Return the elastic energy density plus the step's dissipation potential [J/m^3] at F = I + G.
+def energy_and_stress(material: MaterialParameters, G: wp.mat33d, G_start: wp.mat33d, dt: wp.float64):
+    """Return the energy density Psi [J/m^3] at F = I + G and the first Piola-Kirchhoff stress dPsi/dF [Pa].
+
+    The energy density is the elastic one plus the step's dissipation potential.
 
     Args:
         material: Parameters of the material.
@@ -238,34 +246,39 @@ def energy(material: MaterialParameters, G: wp.mat33d, G_start: wp.mat33d, dt: w
         G_start: Displacement gradient at its start.
         dt: Duration of the step [s].
     """
+    zero = wp.float64(0.0)
+    I = wp.identity(n=3, dtype=wp.float64)
     E = green_strain(G)
-    psi = invariant_energy(material, E, determinant_minus_one(G))
+    j1 = determinant_minus_one(G)
+    psi = invariant_energy(material, E, j1)
+    rest, s, _b, p, _l = invariant_derivatives(material, strain_measure(G), j1)
+    # s F + p cof F with the identity taken out of both: cof(I + G) = I + tr(G) I - G^T + cof G.
+    P = s * G + p * (cofactor(G) - wp.transpose(G)) + (rest + p * wp.trace(G)) * I
     if has_rotation(material.model):
-        _U, sigma, V = singular_values(wp.identity(n=3, dtype=wp.float64) + G)
+        U, sigma, V = singular_values(I + G)
         X = stretch_minus_one(E, sigma, V)
         psi += material.mu * wp.ddot(X, X)
+        P += wp.float64(2.0) * material.mu * (U * X * wp.transpose(V))
     if material.model == int(MaterialModel.STVK):
         psi += hooke_energy(material, E)
-    if material.viscosity > wp.float64(0.0):
-        psi += material.viscosity / dt * hooke_energy(material, E - green_strain(G_start))
+        P += (I + G) * hooke_stress(material, E)
+    if material.viscosity > zero:
+        rate = material.viscosity / dt
+        change = E - green_strain(G_start)
+        psi += rate * hooke_energy(material, change)
+        P += (I + G) * hooke_stress(material, rate * change)
+    return psi, P
+
+
+@wp.func
+def energy(material: MaterialParameters, G: wp.mat33d, G_start: wp.mat33d, dt: wp.float64):
+    """Return the energy density [J/m^3] of :func:`energy_and_stress`."""
+    psi, _P = energy_and_stress(material, G, G_start, dt)
     return psi
 
 
 @wp.func
 def stress(material: MaterialParameters, G: wp.mat33d, G_start: wp.mat33d, dt: wp.float64):
-    """Return the first Piola-Kirchhoff stress [Pa], the derivative of :func:`energy` with respect to F."""
-    I = wp.identity(n=3, dtype=wp.float64)
-    F = I + G
-    rest, s, _b, p, _l = invariant_derivatives(material, strain_measure(G), determinant_minus_one(G))
-    # s F + p cof F with the identity taken out of both: cof(I + G) = I + tr(G) I - G^T + cof G.
-    P = s * G + p * (cofactor(G) - wp.transpose(G)) + (rest + p * wp.trace(G)) * I
-    E = green_strain(G)
-    if has_rotation(material.model):
-        U, sigma, V = singular_values(F)
-        P += wp.float64(2.0) * material.mu * (U * stretch_minus_one(E, sigma, V) * wp.transpose(V))
-    strain = wp.mat33d()
-    if material.model == int(MaterialModel.STVK):
-        strain += E
-    if material.viscosity > wp.float64(0.0):
-        strain += material.viscosity / dt * (E - green_strain(G_start))
-    return P + F * hooke_stress(material, strain)
+    """Return the stress [Pa] of :func:`energy_and_stress`."""
+    _psi, P = energy_and_stress(material, G, G_start, dt)
+    return P

@@ -6,26 +6,28 @@ from collections.abc import Iterable
 from functools import cache
 
 from softmode.deformables.materials import hessian_kernels, material_kernels
-from softmode.deformables.materials import material_cpu_kernels as cpu
-from softmode.deformables.materials.material_kernels import MaterialModel, has_rotation, invariant_derivatives
+from softmode.deformables.materials.material_kernels import (
+    MaterialModel,
+    energy_and_stress,
+    has_rotation,
+    invariant_derivatives,
+)
 from softmode.errors import MaterialError
 
+_ALSO = has_rotation, invariant_derivatives
 PATHS = {
-    "material_kernels.energy": (has_rotation, material_kernels.invariant_energy, material_kernels.energy),
-    "material_kernels.stress": (has_rotation, invariant_derivatives, material_kernels.stress),
-    "hessian_kernels.principal_hessian": (has_rotation, invariant_derivatives, hessian_kernels.principal_hessian),
-    "hessian_kernels.stress_derivative": (has_rotation, invariant_derivatives, hessian_kernels.stress_derivative),
-    "material_cpu_kernels.ENERGY": (cpu.SINGULAR_VALUES, cpu.ENERGY, cpu.LOADS),
-    "material_cpu_kernels.DERIVATIVES": (cpu.SINGULAR_VALUES, cpu.DERIVATIVES, cpu.LOADS),
-    "material_cpu_kernels.HESSIAN": (cpu.SINGULAR_VALUES, cpu.DERIVATIVES, cpu.HESSIAN),
+    "material_kernels.invariant_energy": (has_rotation, material_kernels.invariant_energy, energy_and_stress),
+    "material_kernels.invariant_derivatives": (*_ALSO, energy_and_stress),
+    "hessian_kernels.hooke_strain": (*_ALSO, hessian_kernels.hooke_strain),
+    "hessian_kernels.principal_hessian": (*_ALSO, hessian_kernels.principal_hessian),
 }
-"""Functions of Warp or texts in C++ that together compare a material's model with all that they know."""
+"""Functions that together compare a material's model with all that they know."""
 
 
 @cache
 def paths_without(name: str) -> list[str]:
     """Return the paths that compare with no model of a name."""
-    compared = re.compile(rf"== (?:int\(MaterialModel\.|Eight::)?{name}\b")
+    compared = re.compile(rf"== (?:int\(MaterialModel\.)?{name}\b")
     texts = {path: [x if isinstance(x, str) else inspect.getsource(x) for x in code] for path, code in PATHS.items()}
     return [path for path, code in texts.items() if not any(map(compared.search, code))]
 

@@ -1,7 +1,8 @@
 """Device side of interpolation on CPU: eight points or rows at a time, one in each lane.
 
 The functions of a row are in lanes in memory. Their sums for eight rows are transposed as they are added up, in the
-order of ``lane_kernels.sum8d``, so that from there on a lane is a row.
+order of ``lane_kernels.sum8d``, so that from there on a lane is a row. ``test_cpu_kernels.py`` compares all with
+``deformation_kernels`` and ``struct_kernels``, which take one row.
 """
 
 from typing import Any
@@ -17,7 +18,6 @@ mat38d: Any = wp.types.matrix(shape=(3, LANES), dtype=wp.float64)
 mat68d: Any = wp.types.matrix(shape=(6, LANES), dtype=wp.float64)
 
 SUMS = """
-    #pragma clang fp contract(fast)
     typedef float floats __attribute__((ext_vector_type(8)));
     typedef double lanes __attribute__((ext_vector_type(8)));
     struct Sums {
@@ -36,37 +36,52 @@ SUMS = """
             return __builtin_shufflevector(two[0], two[1], 0, 2, 4, 6, 8, 10, 12, 14)
                 + __builtin_shufflevector(two[0], two[1], 1, 3, 5, 7, 9, 11, 13, 15);
         }
-        static lanes row(const char* at) {
-            floats values;
-            __builtin_memcpy(&values, at, sizeof(values));
-            return __builtin_convertvector(values, lanes);
+        static lanes block(const char* q, int stride, int axis, int b, int count) {
+            lanes x = 0.0;
+            if (stride) __builtin_memcpy(&x, q + sizeof(x) * ((size_t)axis * stride + b), sizeof(x));
+            for (int k = 0; k < 8 && !stride; ++k)
+                if (8 * b + k < count) x[k] = ((const double*)q)[3 * (8 * b + k) + axis];
+            return x;
+        }
+        static void neighbours(const void* data, size_t first, size_t apart, int count, const char** where) {
+            for (int k = 0; k < 8; ++k) where[k] = (const char*)data + first + apart * (k < count ? k : count - 1);
+        }
+        __attribute__((always_inline)) static void rows(const char* const* where, size_t by_block, const char* q,
+                                                        const char* from, int stride, int count, lanes* out) {
+            #pragma clang fp contract(fast)
+            lanes sum[3][8] = {};
+            for (int b = 0; b < (count + 7) / 8; ++b) {
+                lanes x[3];
+                for (int axis = 0; axis < 3; ++axis) {
+                    x[axis] = block(q, stride, axis, b, count);
+                    if (from) x[axis] -= block(from, stride, axis, b, count);
+                }
+                #pragma unroll
+                for (int k = 0; k < 8; ++k) {
+                    floats values;
+                    __builtin_memcpy(&values, where[k] + b * by_block, sizeof(values));
+                    for (int axis = 0; axis < 3; ++axis)
+                        sum[axis][k] += __builtin_convertvector(values, lanes) * x[axis];
+                }
+            }
+            for (int axis = 0; axis < 3; ++axis) out[axis] = of(sum[axis]);
         }
     };
 """
-"""Native code: the sums over the lanes of eight vectors, one in each lane; eight floats in double precision."""
+"""Native code. ``of``: the sums over the lanes of eight vectors, one in each lane. ``rows``: sum_k b_k q_k of eight
+rows, one in each lane, or sum_k b_k (q_k - from_k). It takes where the rows are, how many bytes apart the blocks of
+their functions are, the coordinates, and how many blocks apart their axes; 0 where each function has a vector."""
 
 
 @wp.func_native(
     snippet=f"""{{{SUMS}
-    const size_t by_block = gradient.strides[0], by_point = gradient.strides[1], by_axis = gradient.strides[2];
-    const int stride = q.shape[1] / 3;
-    const int blocks = (function_count + 7) / 8;
-    const lanes* Q = (const lanes*)((const char*)q.data + (size_t)i * q.strides[0]);
-    const char* first = (const char*)gradient.data + (size_t)point * by_point;
-    lanes G[9];
+    const char *q_own = (const char*)q.data + (size_t)i * q.strides[0], *where[8];
+    lanes G[9], column[3];
     for (int c = 0; c < 3; ++c) {{
-        lanes sum[3][8] = {{}};
-        for (int b = 0; b < blocks; ++b) {{
-            lanes x[3];
-            for (int axis = 0; axis < 3; ++axis) __builtin_memcpy(x + axis, Q + axis * stride + b, sizeof(lanes));
-            const char* at = first + b * by_block + c * by_axis;
-            #pragma unroll
-            for (int k = 0; k < 8; ++k) {{
-                const lanes g = Sums::row(at + (k < count ? k : count - 1) * by_point);
-                for (int axis = 0; axis < 3; ++axis) sum[axis][k] += x[axis] * g;
-            }}
-        }}
-        for (int axis = 0; axis < 3; ++axis) G[3 * axis + c] = Sums::of(sum[axis]);
+        const size_t first = (size_t)point * gradient.strides[1] + c * gradient.strides[2];
+        Sums::neighbours(gradient.data, first, gradient.strides[1], count, where);
+        Sums::rows(where, gradient.strides[0], q_own, nullptr, q.shape[1] / 3, function_count, column);
+        for (int axis = 0; axis < 3; ++axis) G[3 * axis + c] = column[axis];
     }}
     if (scale != 1.0)
         for (int k = 0; k < 9; ++k) G[k] = 1.0 / scale * (k % 4 == 0 ? G[k] - (scale - 1.0) : G[k]);
@@ -90,30 +105,14 @@ def elastic_gradients(
 
 @wp.func_native(
     snippet=f"""{{{SUMS}
-    const int stride = rows.shape[1];
-    const int blocks = (function_count + 7) / 8;
-    const lanes* Q = (const lanes*)((const char*)q.data + (size_t)i * q.strides[0]);
-    const lanes* from = (const lanes*)((const char*)q_from.data + (size_t)i * q_from.strides[0]);
-    const char* first = (const char*)rows.data + (size_t)row * rows.strides[0];
-    lanes sum[3][8] = {{}}, out[3];
-    for (int b = 0; b < blocks; ++b) {{
-        lanes x[3], before;
-        for (int axis = 0; axis < 3; ++axis) {{
-            __builtin_memcpy(x + axis, Q + axis * stride + b, sizeof(lanes));
-            if (!change) continue;
-            __builtin_memcpy(&before, from + axis * stride + b, sizeof(lanes));
-            x[axis] -= before;
-        }}
-        #pragma unroll
-        for (int k = 0; k < 8; ++k) {{
-            const lanes value = Sums::row(first + (k < count ? k : count - 1) * rows.strides[0] + 32 * b);
-            for (int axis = 0; axis < 3; ++axis) sum[axis][k] += value * x[axis];
-        }}
-    }}
-    for (int axis = 0; axis < 3; ++axis) out[axis] = Sums::of(sum[axis]);
-    wp::mat_t<3, 8, wp::float64> found;
-    __builtin_memcpy(&found, out, sizeof(found));
-    return found;
+    const char *q_own = (const char*)q.data + (size_t)i * q.strides[0], *where[8];
+    const char* before = change ? (const char*)q_from.data + (size_t)i * q_from.strides[0] : nullptr;
+    Sums::neighbours(rows.data, (size_t)row * rows.strides[0], rows.strides[0], count, where);
+    lanes found[3];
+    Sums::rows(where, sizeof(floats), q_own, before, rows.shape[1], function_count, found);
+    wp::mat_t<3, 8, wp::float64> out;
+    __builtin_memcpy(&out, found, sizeof(out));
+    return out;
 }}"""
 )
 def interpolate_rows(
@@ -132,30 +131,14 @@ def interpolate_rows(
 
 @wp.func_native(
     snippet=f"""{{{SUMS}
-    const int blocks = (function_count + 7) / 8;
-    const double* both[2] = {{(const double*)q.data + 3 * (size_t)begin, (const double*)qd.data + 3 * (size_t)begin}};
-    const char* first = (const char*)rows.data + (size_t)row * rows.strides[0];
-    lanes out[6];
-    for (int which = 0; which < 2; ++which) {{
-        lanes sum[3][8] = {{}};
-        for (int b = 0; b < blocks; ++b) {{
-            lanes x[3];
-            for (int lane = 0; lane < 8; ++lane) {{
-                const bool idle = 8 * b + lane >= function_count;
-                const double* at = both[which] + 3 * (idle ? 0 : 8 * b + lane);
-                for (int axis = 0; axis < 3; ++axis) x[axis][lane] = idle ? 0.0 : at[axis];
-            }}
-            #pragma unroll
-            for (int k = 0; k < 8; ++k) {{
-                const lanes value = Sums::row(first + (k < count ? k : count - 1) * rows.strides[0] + 32 * b);
-                for (int axis = 0; axis < 3; ++axis) sum[axis][k] += value * x[axis];
-            }}
-        }}
-        for (int axis = 0; axis < 3; ++axis) out[3 * which + axis] = Sums::of(sum[axis]);
-    }}
-    wp::mat_t<6, 8, wp::float64> found;
-    __builtin_memcpy(&found, out, sizeof(found));
-    return found;
+    const char *q_own = (const char*)(q.data + begin), *qd_own = (const char*)(qd.data + begin), *where[8];
+    Sums::neighbours(rows.data, (size_t)row * rows.strides[0], rows.strides[0], count, where);
+    lanes found[6];
+    Sums::rows(where, sizeof(floats), q_own, nullptr, 0, function_count, found);
+    Sums::rows(where, sizeof(floats), qd_own, nullptr, 0, function_count, found + 3);
+    wp::mat_t<6, 8, wp::float64> out;
+    __builtin_memcpy(&out, found, sizeof(out));
+    return out;
 }}"""
 )
 def interpolate_state(

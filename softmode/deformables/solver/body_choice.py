@@ -38,7 +38,7 @@ class BodyChoice:
         materials: What each is made of; only what :func:`set_parameters` does not set is taken from it.
 
     Raises:
-        ConfigError: If a body is not among the solver's or has pins, or one with exact regions is NEO_HOOKEAN.
+        ConfigError: If a body is not among the solver's or has pins; for exact regions see `require_materials`.
     """
 
     def __init__(self, solver: ReducedSolver, bodies: Sequence[ReducedBody], materials: Sequence[Material]) -> None:

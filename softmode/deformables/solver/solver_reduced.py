@@ -8,7 +8,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from softmode.deformables.body.reduced_body import ReducedBody
-from softmode.deformables.materials.material_kernels import MaterialModel
+from softmode.deformables.materials.material_kernels import MaterialModel, needs_volume
 from softmode.deformables.materials.paths import require_models
 from softmode.deformables.model.authoring import (
     NAMESPACE,
@@ -217,12 +217,14 @@ def require_materials(driven_counts: ArrayLike, models: ArrayLike) -> None:
         models: Numbers of the material models.
 
     Raises:
-        ConfigError: If a body with exact regions is NEO_HOOKEAN.
+        ConfigError: If a body with exact regions has an energy that is infinite at J <= 0.
         MaterialError: If a model is not known to all code that evaluates it.
     """
     require_models(np.unique(models).tolist())
-    if (np.asarray(driven_counts)[np.asarray(models) == int(MaterialModel.NEO_HOOKEAN)] > 0).any():
-        raise ConfigError(
-            "a body with exact regions has the material NEO_HOOKEAN, which a driven region may invert in one step",
-            hint="use STABLE_NEO_HOOKEAN_LOG, or a soft region",
-        )
+    for count, model in zip(np.ravel(driven_counts), np.ravel(models), strict=True):
+        if count > 0 and needs_volume(int(model)):
+            name = MaterialModel(model).name
+            raise ConfigError(
+                f"a body with exact regions has the material {name}, which a driven region may invert in one step",
+                hint="use STABLE_NEO_HOOKEAN_LOG, or a soft region",
+            )

@@ -22,15 +22,15 @@ from typing import Any
 
 import warp as wp
 
-from softmode.deformables.contact.penalty_kernels import contact_potential, slip_potential
+from softmode.deformables.contact.response_kernels import FIRST, KEEP, RELAX, SET, contact_response
 from softmode.deformables.materials.hessian_kernels import hessian
 from softmode.deformables.materials.material_kernels import (
     MaterialModel,
     MaterialParameters,
     determinant_minus_one,
-    energy,
+    energy_and_stress,
     lame,
-    stress,
+    needs_volume,
 )
 from softmode.deformables.model.declare import kernel_over
 from softmode.deformables.model.deformation_kernels import elastic_gradient
@@ -76,8 +76,6 @@ wp.set_module_options({"enable_backward": False})
 
 EXTRAPOLATION_INERTIA = wp.constant(wp.float64(0.01))
 """Least rho L^2 / (E dt^2) of a body whose acceleration is carried on."""
-NEEDS_FEASIBLE_START = wp.constant(int(MaterialModel.NEO_HOOKEAN))
-"""The material that forbids inversion: a step starts where the last one ended."""
 ENERGY_ROUNDING = wp.constant(wp.float64(2.0e-17))
 """What rounding leaves of the elastic energy of a body that has turned, over E V: a tenth of float64's unit, since the
 errors of its points differ in sign."""
@@ -182,7 +180,7 @@ def begin_step(
         c = wp.float64(1.5)
     # Newton starts from the motion that goes on; a material that forbids inversion wants a feasible start
     ahead = wp.float64(1.0)
-    if step.instances.material_model[i] == NEEDS_FEASIBLE_START:
+    if needs_volume(step.instances.material_model[i]):
         ahead = wp.float64(0.0)
     third = wp.float64(1.0) / wp.float64(3.0)
     for axis in range(3):
@@ -394,9 +392,10 @@ def evaluate_point(
     G_start = G
     if step.instances.viscosity[i] > 0.0:
         G_start = step.points.start[i, p]
-    step.points.energy[i, p] = s * s * weight * energy(parameters, G, G_start, dt)
+    psi, P = energy_and_stress(parameters, G, G_start, dt)
+    step.points.energy[i, p] = s * s * weight * psi
     if derivatives != ENERGIES:
-        step.points.stress[i, p] = s * weight * stress(parameters, G, G_start, dt)
+        step.points.stress[i, p] = s * weight * P
         step.points.volume_ratio[i, p] = float(wp.float64(1.0) + determinant_minus_one(G))
     if derivatives == ALL and step.state.refresh[w] != 0:
         C = float(weight) * hessian(parameters, G, G_start, dt, step.state.project[w])
@@ -404,6 +403,19 @@ def evaluate_point(
 
 
 evaluate_points = kernel_over(evaluate_point, "evaluate_points", "i", "p", "lane")
+
+
+@wp.func
+def normal_force_mode(step: NewtonStep, derivatives: int, w: int):
+    """Return what becomes of the normal force that friction goes by, see ``response_kernels.KEEP``."""
+    iteration = step.state.iteration[w]
+    if derivatives == 0 or iteration > step.state.friction_lag:
+        return int(KEEP)
+    if iteration == 0:
+        return int(FIRST)
+    if iteration > RELAXED_AFTER:
+        return int(RELAX)
+    return int(SET)
 
 
 @wp.func
@@ -450,46 +462,30 @@ def evaluate_constraint(
         for k in range(step.constraints.dof_begin[i, e], step.constraints.dof_end[i, e]):
             d -= r[w, k] * wp.vec3d(step.constraints.jacobian[i, e, k])
         step.constraints.displacement[i, e] = d
-    stiffness = step.constraints.stiffness[i, e]
-    identity = wp.identity(n=3, dtype=wp.float64)
-    H = stiffness * identity
-    if e < step.instances.pin_count[i]:
-        x = step.constraints.offset[i, e] + d
-        step.constraints.energy[i, e] = wp.float64(0.5) * stiffness * wp.length_sq(x)
-        step.constraints.force[i, e] = -stiffness * x
-    else:
-        n = step.constraints.normal[i, e]
-        total = step.constraints.offset[i, e] + d
-        psi, slope, curvature = contact_potential(step.constraints, smoothing, -wp.dot(n, total), i, e)
-        if derivatives != 0 and step.state.iteration[w] <= step.state.friction_lag:
-            held = slope
-            if step.state.iteration[w] == 0:
-                # in an impact the first guess lies far too deep: friction of such a force would be too stiff to solve
-                gap = wp.min(wp.dot(n, step.constraints.offset[i, e]), wp.float64(0.0))
-                deep = wp.float64(smoothing) - wp.float64(2.0) * gap
-                _psi, most, _curvature = contact_potential(step.constraints, smoothing, deep, i, e)
-                held = wp.min(slope, most)
-            pressed = stiffness * held
-            if step.state.iteration[w] > RELAXED_AFTER:
-                # the fixed point between normal force and friction may be repelling: a mean of two iterates is not
-                pressed = wp.float64(0.5) * (pressed + step.constraints.normal_force[i, e])
+    mode = normal_force_mode(step, derivatives, w)
+    pinned = e < step.instances.pin_count[i]
+    energy, force, H, pressed, slip = contact_response(
+        pinned,
+        step.constraints.offset[i, e],
+        step.constraints.normal[i, e],
+        d,
+        step.constraints.stiffness[i, e],
+        step.constraints.dent_compliance[i, e],
+        step.constraints.dent_depth[i, e],
+        step.constraints.friction[i, e],
+        step.constraints.stick[i, e],
+        step.constraints.normal_force[i, e],
+        wp.float64(smoothing),
+        step.options.stick_range,
+        mode,
+        step.state.exact[w],
+    )
+    step.constraints.energy[i, e] = share * energy
+    step.constraints.force[i, e] = force
+    if not pinned:
+        step.constraints.slip[i, e] = slip
+        if mode != int(KEEP):
             step.constraints.normal_force[i, e] = pressed
-        normal_force = step.constraints.normal_force[i, e]
-        # offset = gap n + memory - drift of the shape: the tangential part is the slip
-        t = total - wp.dot(n, total) * n
-        y = wp.length(t)
-        limit = step.constraints.friction[i, e] * normal_force
-        stick = step.constraints.stick[i, e]
-        f0, secant, tangent = slip_potential(y, limit, stick, step.options.stick_range)
-        step.constraints.slip[i, e] = t
-        step.constraints.energy[i, e] = share * (stiffness * psi + f0)
-        step.constraints.force[i, e] = stiffness * slope * n - secant * t
-        # f0 is concave in y^2, so the quadratic of the secant's curvature lies above it and its steps cannot overshoot,
-        # from however far away; the potential's own curvature along the slip converges faster once the state is close
-        N = wp.outer(n, n)
-        H = stiffness * curvature * N + secant * (identity - N)
-        if step.state.exact[w] != 0 and y > wp.float64(1.0e-9) * step.options.stick_range:
-            H += (tangent - secant) / (y * y) * wp.outer(t, t)
     if derivatives != 0:
         step.constraints.hessian[i, e] = wp.mat33(H)
         for k in range(step.constraints.dof_begin[i, e], step.constraints.dof_end[i, e]):
