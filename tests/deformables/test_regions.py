@@ -18,7 +18,7 @@ from softmode.deformables.build.build_body import build_body
 from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.build.quadrature import quadrature_from_box, quadrature_from_capsule
 from softmode.deformables.build.quadrature_grid import Quadrature
-from softmode.deformables.build.region_samples import octants_near, refine_at_faces
+from softmode.deformables.build.region_samples import pieces_near, refine_at_faces
 from softmode.errors import BasisError, ConfigError
 from tests.bodies import assert_same
 
@@ -120,11 +120,11 @@ def test_identities_hold_with_regions(body: ReducedBody, quadrature: Quadrature)
     """(1/V) sum V_p b_k b_l = delta_kl, the mean, linear reproduction, on the quadrature refined at the faces."""
     body.check()
     moved = [region.moved(-body.offset, quadrature.bounds) for region in body.regions]
-    points, weights, _ = octants_near(quadrature, moved)
-    x, volume, parent = refine_at_faces(body.regions, points - body.offset, weights, quadrature.spacing)
+    pieces = pieces_near(quadrature, moved)
+    x, volume, parent = refine_at_faces(body.regions, pieces, body.offset)
     assert volume.sum() == pytest.approx(quadrature.volume, rel=1e-12)
     moment = np.stack([np.bincount(parent, volume * axis) for axis in x.T], axis=1)
-    expected = weights[:, None] * (points - body.offset)
+    expected = pieces.weights[:, None] * (pieces.points - body.offset)
     np.testing.assert_allclose(moment, expected, atol=1e-13 * quadrature.volume)
     value, _ = body.evaluate(x)
     share = volume / quadrature.volume
@@ -218,7 +218,8 @@ def test_region_volumes(quadrature: Quadrature) -> None:
     """The weights of a region sum to its volume and first moment, also where its face cuts cells."""
     for cut in (-0.13, -0.125, -0.121):
         region = Region(name="r", box=((-INF, -INF, -INF), (cut, INF, INF)), stiffness=1.0)
-        x, w = region.integrate(*octants_near(quadrature, [region])[:2], quadrature.spacing)
+        pieces = pieces_near(quadrature, [region])
+        x, w = region.integrate(pieces.points, pieces.weights, pieces.edges, pieces.axes)
         assert w.sum() == pytest.approx((cut + 0.2) * 0.1 * 0.08, rel=0.01)
         assert w @ x[:, 0] / w.sum() == pytest.approx(0.5 * (cut - 0.2), rel=0.01)
 

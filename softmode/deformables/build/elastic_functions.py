@@ -45,17 +45,24 @@ SPACE_MODE_COUNTS = 48, 96
 too stiff with 48 and 1.5 % with 96, for three times the time."""
 SPACE_ERROR = 0.02
 """The space is made larger where its second half lowers one of the first six frequencies by more than this."""
+SPACE_WARNING = 0.05
+"""A build says so where the space is not settled by more than this; so does the report of a body."""
 TARGET_COUNT = 40
 """Elastic modes among the targets; it does not depend on the number of functions, or these would not be nested."""
 JUDGED_COUNT = 6
 """The error of a choice is that of the first so many frequencies."""
-SPACE_TOLERANCE = 1e-9
-"""Directions of the scaled mass Gram matrix of the space under this fraction of the largest are rounding."""
+SPACE_TOLERANCE, HELD_SPACE_TOLERANCE = 1e-9, 1e-11
+"""Directions of the scaled mass Gram matrix of the space under this fraction of the largest are rounding. On a body
+with regions a function of little mass may decide the energy: a spiral strip was 5 % too stiff with the first."""
 NEGLIGIBLE = 1e-13
 """Singular vectors under this fraction of the largest energy are rounding."""
 EQUAL = 0.95
 """Singular vectors whose energies are nearer than this contribute alike: symmetric bodies have clusters of them. Those
 of a star differ by 4 % at most within a cluster and by 6 % and more between two."""
+TURN_COUNT, TURN_LEVEL = 6, 3.0
+"""Where exact regions move against each other, targets are also the first so many eigenmodes times affine motion, those
+of the first so many times unit energy. A twist by theta(x) is cos theta y and sin theta z, of which linear modes hold
+the first order: a beam turned by 720 degrees has three times the error without them."""
 AMPLITUDE = 0.25
 """Half the angle [rad] through which a body turns where static responses of first and second order weigh alike."""
 BLOCK, BLOCK_STEPS = 16, 12
@@ -74,6 +81,10 @@ class Held:
     """Rigid motions of every exact region in the driven functions, shape (3 r, M); M = 0 for fewer than two."""
     springs: Array
     """Raw functions at points of soft regions, times the root of kappa V_p / (E V) [1/m], shape (S, R)."""
+    turned: NDArray[np.intp]
+    """Raw functions that are slow functions times affine motion, shape (T,); none for fewer than two exact regions."""
+    level: Array
+    """What each of these is to weigh, shape (T,)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -223,7 +234,10 @@ class _ElasticSpace:
         value *= sign
         transform = lead @ np.linalg.inv(upper * sign[:, None])
         counts = [lead.shape[1]]
-        for index, tolerance in ((kept, KEPT_TOLERANCE), (others, SPACE_TOLERANCE)):
+        for index, tolerance in (
+            (kept, KEPT_TOLERANCE),
+            (others, SPACE_TOLERANCE if held is None else HELD_SPACE_TOLERANCE),
+        ):
             if not len(index):
                 counts.append(counts[-1])
                 continue
@@ -267,6 +281,9 @@ class _ElasticSpace:
             self.energy = self.energy + self.springs
             self.mean = self.transform.T @ (raw.T @ mass)
             self.slopes, self.stiff = [raw_gradient[:, :, d] for d in range(3)], stiff
+            turned = self.transform.T @ (raw.T @ (mass[:, None] * raw[:, held.turned]))
+            turned *= TURN_LEVEL * held.level / np.sqrt(np.einsum("ak,ab,bk->k", turned, self.energy, turned))
+            self.turned = np.concatenate([turned, np.zeros((2 * self.count, turned.shape[1]))])
 
     def order(
         self, fields: Array | None, poissons_ratios: tuple[float, ...], count: int
@@ -293,7 +310,7 @@ class _ElasticSpace:
         if self.held is not None:
             responses, more = self._responses(self.held, sum(poissons_ratios) / len(poissons_ratios))
             blocks.append(responses)
-            targets.append(more)
+            targets += [more, self.turned]
         found, shares = np.eye(self.count, self.fixed), np.full(self.fixed, np.inf)
         for block in [*blocks, np.concatenate(targets, axis=1)]:
             found, share = self._extend(found, block, count)
@@ -353,7 +370,10 @@ class _ElasticSpace:
         load, turn = second_order_load(self.slopes, self.stiff, raw, poissons_ratio)
         reduced = np.einsum("rv,arp->avp", self.transform, load.reshape(3, len(self.transform), -1))
         i, j = np.triu_indices(3)
-        more = [AMPLITUDE * np.sqrt(turn[i] * turn[j]) * linalg.cho_solve(factor, reduced.reshape(len(first), -1))]
+        load = AMPLITUDE * np.sqrt(turn[i] * turn[j]) * reduced.reshape(len(first), -1)
+        second = linalg.cho_solve(factor, load)
+        # Of unit energy at most: of a plate, whose plane is stiff, they would leave no room for modes.
+        more = [second / np.sqrt(np.maximum(np.einsum("ak,ak->k", second, load), 1.0))]
         if held.motions.shape[1]:
             # Constraint modes: the body's answer to rigid motions of its exact regions, as Ritz modes of unit energy.
             whole, free = elastic_stiffness(self.products, poissons_ratio), np.zeros(3 * self.products.shape[1], bool)
