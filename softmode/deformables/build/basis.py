@@ -174,7 +174,8 @@ def _ground(domain: Domain, options: BuildOptions) -> _Ground:
     """Return the kernels of a domain and the weights of its regions."""
     count = options.kernels(len(domain.seeds))
     kernels = make_basis(domain.seeds, count, kernel=options.kernel, spacing=domain.spacing, seed=options.seed)
-    while domain.regions and options.kernel_count is None and _narrow(kernels, domain) and count > KERNEL_LEAST:
+    few = KERNEL_LEAST if domain.regions and options.kernel_count is None else count
+    while count > few and np.median(kernels.radii) < KERNEL_EDGE * domain.edge:
         count = max(count * 4 // 5, KERNEL_LEAST)
         kernels = make_basis(domain.seeds, count, kernel=options.kernel, spacing=domain.spacing, seed=options.seed)
     if domain.material is not None:
@@ -198,11 +199,6 @@ def _ground(domain: Domain, options: BuildOptions) -> _Ground:
             domain, shape, blend_slope, *(None if x is None else scalar * x for x in (springs, pull))
         ),
     )
-
-
-def _narrow(kernels: BasisRKPM, domain: Domain) -> bool:
-    """Return whether kernels are too narrow for the octants."""
-    return float(np.median(kernels.radii)) < KERNEL_EDGE * domain.edge
 
 
 def _modes(ground: _Ground, domain: Domain, options: BuildOptions, count: int) -> Eigenmodes:

@@ -11,12 +11,15 @@ out 3.4 times too stiff. Here the functions are chosen for elasticity itself, ou
 3. The choice: the three components of every target, each target at unit energy and weighted by w = min(1, omega_1^2 /
    omega^2), are columns of one matrix. Its singular vectors in gradient energy come in the order of what they carry.
 
-On a body with regions the space vanishes on the exact ones, and the functions that carry their motion come first. Then
+On a body with exact regions the space is made of eigenmodes of the free body times an envelope that vanishes there, and
+on one with any regions also of translations along static responses and elastic modes of the kernels, which know how a
+section warps. The functions that carry the regions' motion come first. Then
 come the static responses to unit body forces, kept exactly: what eigenmodes lack in a response is small but decides its
 energy. The targets are the elastic modes of the held body, the second order of the static responses at a turn of half a
 radian, and the constraint modes of exact regions that move against each other (Craig and Bampton 1968,
 doi:10.2514/3.4741). Weights are w = min(1, omega_1 / omega): a turn between two clamps is far from what linear modes
-say, and wants higher ones. With omega^2 a beam that is twisted by 720 degrees has ten times the error.
+say, and wants higher ones. With omega^2 a beam that is twisted by 720 degrees has ten times the error. Such a turn also
+wants products of slow functions with affine motion, which are targets too; the first modes then weigh as much as these.
 
 The functions of a smaller count are the first of a larger one, so that more functions never make a body stiffer. The
 choice is the one of modal substructuring with all components taken apart (von Tycowicz et al. 2013,
@@ -63,6 +66,8 @@ TURN_COUNT, TURN_LEVEL = 6, 3.0
 """Where exact regions move against each other, targets are also the first so many eigenmodes times affine motion, those
 of the first so many times unit energy. A twist by theta(x) is cos theta y and sin theta z, of which linear modes hold
 the first order: a beam turned by 720 degrees has three times the error without them."""
+TURN_MODES = 5
+"""So many elastic modes then weigh as many times more, or a plate held at two edges has its fourth 10 % too high."""
 AMPLITUDE = 0.25
 """Half the angle [rad] through which a body turns where static responses of first and second order weigh alike."""
 BLOCK, BLOCK_STEPS = 16, 12
@@ -305,6 +310,8 @@ class _ElasticSpace:
             share = np.minimum(1.0, first / np.maximum(value, floor))
             if self.held is not None:
                 share = np.sqrt(share)  # What regions drive far from rest wants higher modes.
+                if self.turned.shape[1]:
+                    share[:TURN_MODES] *= TURN_LEVEL
             targets.append(target * (share / np.sqrt(np.maximum(value, floor))))
         blocks = []
         if self.held is not None:
