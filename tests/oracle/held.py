@@ -361,7 +361,7 @@ def _tetrahedra(name: str) -> Held:
         tip, width = (0.075, -0.0105, 0.0), 0.006
 
     def elements() -> tuple[Any, Callable[[Array], Mask]]:
-        import tetgen
+        import tetgen  # pyright: ignore[reportMissingImports]
         from skfem import MeshTet
 
         free = less(solid, box(lower, upper))
@@ -370,7 +370,9 @@ def _tetrahedra(name: str) -> Held:
         options = {"order": 1, "mindihedral": 12.0, "minratio": 1.4, "fixedvolume": True, "quality": True}
         nodes, corners = maker.tetrahedralize(maxvolume=volume, **options)[:2]
         mesh = MeshTet(np.ascontiguousarray(nodes.T), np.ascontiguousarray(corners[:, :4].T))
-        return mesh, lambda X: ((X >= lower[:, None] - 1e-6) & (X <= upper[:, None] + 1e-6)).all(axis=0)
+        return mesh, lambda X: np.logical_and.reduce(
+            (X >= lower[:, None] - 1e-6) & (X <= upper[:, None] + 1e-6), axis=0
+        )
 
     return Held(
         quadrature=lambda: quadrature_from_mesh(solid.vertices, solid.faces),
@@ -398,7 +400,7 @@ SOLIDS: dict[str, Callable[[], Held]] = {
 
 def solve(name: str, poissons_ratio: float) -> dict[str, Any]:
     """Return what finite elements give."""
-    import pypardiso
+    import pypardiso  # pyright: ignore[reportMissingImports]
     import scipy.sparse as sp
     from scipy.sparse.linalg import LinearOperator, eigsh
     from skfem import (

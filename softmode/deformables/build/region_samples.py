@@ -216,7 +216,7 @@ def refine_at_faces(regions: Sequence[Region], pieces: Pieces, offset: Array) ->
         Points [m] (P', 3), volumes [m^3] (P',), and the piece that each came from (P',).
     """
     points, weights, edges, frame = pieces.points - offset, pieces.weights.copy(), pieces.edges.copy(), pieces.axes
-    parent, boxes = np.arange(len(points)), edges.any(axis=1)
+    parent, boxes = np.arange(len(points)), np.einsum("pa->p", edges) > 0.0
     near, across = boxes & ~boxes.all(), np.full(len(points), -1)
     within = np.zeros(len(points), dtype=bool)
     for region in (region for region in regions if region.stiffness is None):
