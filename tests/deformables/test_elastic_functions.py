@@ -124,6 +124,20 @@ def test_accuracy_out_of_reach_is_refused() -> None:
         built(accuracy=1e-7)
 
 
+def test_a_build_says_what_makes_a_body_too_stiff() -> None:
+    """A space that is not settled to 5 %, with the report's own figure; and a ratio that wants more functions."""
+    plate = quadrature_from_box((0.2, 0.2, 0.004), point_count=600, **FEW)
+    options = BuildOptions(kernel_count=100, poissons_ratio=0.499)
+    with pytest.warns(RuntimeWarning) as told:
+        body = build_body(plate, options, name="sheet", progress=False)
+    texts = [str(one.message) for one in told]
+    space = float(str(body.provenance["space_error"]))
+    assert any(text.startswith(f"body 'sheet': space_error {100.0 * space:.0f} %") for text in texts)
+    assert any("at nu = 0.499; give function_count=80" in text for text in texts)
+    found = [finding for finding in report_body(body).findings if finding.name == "space"]
+    assert f"{100.0 * space:.0f} % too high" in found[0].what
+
+
 @pytest.mark.rest
 def test_the_space_grows_where_it_must() -> None:
     """A bar keeps the smaller space, a thin tube takes the larger one, and says how far from settled it is."""

@@ -18,7 +18,7 @@ from softmode.deformables.build.build_body import build_body
 from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.build.quadrature import quadrature_from_box, quadrature_from_capsule
 from softmode.deformables.build.quadrature_grid import Quadrature
-from softmode.deformables.build.region_samples import octants_near, refine_at_faces
+from softmode.deformables.build.region_samples import pieces_near, refine_at_faces
 from softmode.errors import BasisError, ConfigError
 from tests.bodies import assert_same
 
@@ -78,6 +78,15 @@ def inner_points(region: Region, rng: np.random.Generator) -> np.ndarray:
     return np.concatenate([x[distance <= 0.0], (x - np.maximum(distance, 0.0)[:, None] * normal)[:50]])
 
 
+def test_bodies_of_files_before_keep_their_functions() -> None:
+    """A body of version 3, whose envelope was as wide as the body, has the functions that it was built with."""
+    body, beside = ReducedBody.load_with(Path(__file__).with_name("held_version_3.npz"))
+    assert body.envelope_length == 0.0
+    value, gradient = body.evaluate(beside["check.points"])
+    np.testing.assert_allclose(value, beside["check.values"], atol=1e-12 * np.abs(value).max())
+    np.testing.assert_allclose(gradient, beside["check.gradients"], atol=1e-6 * np.abs(gradient).max())
+
+
 @pytest.mark.parametrize("region", [LEFT, RIGHT, SOFT, Region(name="r", box=((0, 0, 0), (0.1, 0, 0)), radius=0.02)])
 def test_distance_is_one_lipschitz_and_its_gradient_is_right(region: Region) -> None:
     """|grad d| = 1; grad d by central differences away from the medial axis; d = 0 on the projection x - d grad d."""
@@ -95,10 +104,11 @@ def test_distance_is_one_lipschitz_and_its_gradient_is_right(region: Region) -> 
     assert np.abs(region.distance(face)[0]).max() < 1e-12
 
 
-def test_envelope_vanishes_on_regions_and_blends_are_a_partition() -> None:
+@pytest.mark.parametrize("wide", [False, True], ids=["narrow", "of version 3"])
+def test_envelope_vanishes_on_regions_and_blends_are_a_partition(wide: bool) -> None:
     """G = 0 on every region and > 0 elsewhere; sum T_i = 1, T_i = 1 on region i; gradients by finite differences."""
     rng = np.random.default_rng(1)
-    envelope = Envelope((LEFT, RIGHT, Region(name="top", points=[[0.0, 0.0, 0.3]], radius=0.05)), 0.1)
+    envelope = Envelope((LEFT, RIGHT, Region(name="top", points=[[0.0, 0.0, 0.3]], radius=0.05)), 0.1, wide)
     x = rng.uniform(-0.3, 0.3, size=(400, 3))
     value, gradient, blend, blend_gradient = envelope.evaluate(x)
     outside = np.min([region.distance(x)[0] for region in envelope.regions], axis=0) > 0.0
@@ -120,11 +130,11 @@ def test_identities_hold_with_regions(body: ReducedBody, quadrature: Quadrature)
     """(1/V) sum V_p b_k b_l = delta_kl, the mean, linear reproduction, on the quadrature refined at the faces."""
     body.check()
     moved = [region.moved(-body.offset, quadrature.bounds) for region in body.regions]
-    points, weights, _ = octants_near(quadrature, moved)
-    x, volume, parent = refine_at_faces(body.regions, points - body.offset, weights, quadrature.spacing)
+    pieces = pieces_near(quadrature, moved)
+    x, volume, parent = refine_at_faces(body.regions, pieces, body.offset)
     assert volume.sum() == pytest.approx(quadrature.volume, rel=1e-12)
     moment = np.stack([np.bincount(parent, volume * axis) for axis in x.T], axis=1)
-    expected = weights[:, None] * (points - body.offset)
+    expected = pieces.weights[:, None] * (pieces.points - body.offset)
     np.testing.assert_allclose(moment, expected, atol=1e-13 * quadrature.volume)
     value, _ = body.evaluate(x)
     share = volume / quadrature.volume
@@ -169,6 +179,27 @@ def test_gradients_match_finite_differences(body: ReducedBody) -> None:
         shift = step * np.eye(3)[d]
         difference = (body.evaluate(points + shift)[0] - body.evaluate(points - shift)[0]) / (2.0 * step)
         assert np.abs(difference - gradient[:, :, d]).max() < 1e-6 * np.abs(gradient).max()
+
+
+def test_regions_are_exact_beyond_the_kernels_reach(body: ReducedBody) -> None:
+    """Points of a region that no kernel reaches, of 200 seeds: others vanish, the region moves as it is told."""
+    rng = np.random.default_rng(6)
+    count = len(body.regions)
+    matrix, shift = rng.normal(size=(count, 3, 3)), rng.normal(size=(count, 3))
+    q = rng.normal(size=(body.function_count, 3))
+    q[: body.driven_count] = body.driven_affine(matrix, shift)
+    for i, region in enumerate(body.regions):
+        if region.stiffness is None:
+            every = np.concatenate([inner_points(region, np.random.default_rng(seed)) for seed in range(200)])
+            x = every[~body.covers(every)]
+            assert len(x) or count > 1
+            value, gradient = body.evaluate(x)
+            assert np.abs(value[:, body.driven_count :]).max(initial=0.0) < 1e-12
+            terms = np.abs(value) @ np.abs(q)
+            assert (np.abs(x + value @ q - (x @ matrix[i].T + shift[i])) < 1e-11 * (1.0 + terms)).all()
+            inside = region.distance(x)[0] < -1e-6
+            turned = np.eye(3) + np.einsum("pkd,kc->pcd", gradient[inside], q)
+            np.testing.assert_allclose(turned, np.broadcast_to(matrix[i], turned.shape), atol=1e-9)
 
 
 def test_only_driven_functions_live_on_exact_regions(body: ReducedBody) -> None:
@@ -218,7 +249,8 @@ def test_region_volumes(quadrature: Quadrature) -> None:
     """The weights of a region sum to its volume and first moment, also where its face cuts cells."""
     for cut in (-0.13, -0.125, -0.121):
         region = Region(name="r", box=((-INF, -INF, -INF), (cut, INF, INF)), stiffness=1.0)
-        x, w = region.integrate(*octants_near(quadrature, [region])[:2], quadrature.spacing)
+        pieces = pieces_near(quadrature, [region])
+        x, w = region.integrate(pieces.points, pieces.weights, pieces.edges, pieces.axes)
         assert w.sum() == pytest.approx((cut + 0.2) * 0.1 * 0.08, rel=0.01)
         assert w @ x[:, 0] / w.sum() == pytest.approx(0.5 * (cut - 0.2), rel=0.01)
 
@@ -252,7 +284,10 @@ def test_check_refuses_inconsistent_region_fields() -> None:
 
 
 def test_bad_regions_are_refused(quadrature: Quadrature) -> None:
-    """Wrong shapes and ranges raise ConfigError; empty, overlapping and all-embracing regions BasisError."""
+    """Wrong shapes and ranges raise ConfigError; empty, overlapping and all-embracing regions BasisError.
+
+    Soft ones that overlap, and ones thinner than the cells, are said.
+    """
     for bad in (
         {},
         {"box": ((0, 0, 0), (1, 1, 1)), "points": [[0, 0, 0]]},
@@ -271,6 +306,12 @@ def test_bad_regions_are_refused(quadrature: Quadrature) -> None:
         build_body(quadrature, OPTIONS, regions=(nowhere,))
     with pytest.raises(BasisError, match="overlap"):
         build_body(quadrature, OPTIONS, regions=(LEFT, dataclasses.replace(LEFT, name="again")))
+    soft = dataclasses.replace(LEFT, stiffness=1e3)
+    with pytest.warns(RuntimeWarning, match="regions 'left' and 'again' overlap: their springs add up"):
+        build_body(quadrature, OPTIONS, regions=(soft, dataclasses.replace(soft, name="again")))
+    sheet = Region(name="sheet", box=((-0.02, -INF, -INF), (-0.018, INF, INF)))
+    with pytest.warns(RuntimeWarning, match="region 'sheet' is 2 mm thick, the cells there"):
+        build_body(quadrature, OPTIONS, regions=(sheet,))
     everything = Region(name="all", box=((-INF,) * 3, (INF,) * 3))
     with pytest.raises(BasisError, match="whole body"):
         build_body(quadrature, OPTIONS, regions=(everything,))

@@ -19,7 +19,7 @@ from softmode.deformables.build.galerkin import elastic_matrix, mass_and_gradien
 from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.build.quadrature import quadrature_from_box
 from softmode.deformables.build.quadrature_grid import Quadrature
-from softmode.deformables.build.region_samples import octants_near, refine_at_faces
+from softmode.deformables.build.region_samples import pieces_near, refine_at_faces
 from softmode.deformables.build.static_response import (
     lame_parameters,
     second_order_load,
@@ -42,9 +42,9 @@ def quadrature() -> Quadrature:
 
 def held(quadrature: Quadrature, *regions: Region, kernel_count: int = 150) -> tuple[ShapeFunctions, np.ndarray, tuple]:
     """Return kernels that vanish on regions, quadrature weights, and blends with their gradients."""
-    places, volumes, _ = octants_near(quadrature, regions)
-    points, weights, _ = refine_at_faces(regions, places, volumes, quadrature.spacing)
-    basis = make_basis(places, kernel_count, spacing=quadrature.spacing)
+    pieces = pieces_near(quadrature, regions)
+    points, weights, _ = refine_at_faces(regions, pieces, np.zeros(3))
+    basis = make_basis(pieces.points, kernel_count, spacing=quadrature.spacing)
     shape, *blends = enveloped(basis.evaluate(points), Envelope(regions, 0.1) if regions else None)
     return shape, weights, tuple(blends)
 
@@ -137,7 +137,8 @@ def test_modes_of_a_held_beam(quadrature: Quadrature) -> None:
     basis = make_basis(quadrature.points, 250, spacing=quadrature.spacing)
     plain = basis.evaluate(quadrature.points)
     soft = dataclasses.replace(LEFT, stiffness=1.0)
-    x, w = soft.integrate(*octants_near(quadrature, [soft])[:2], quadrature.spacing)
+    pieces = pieces_near(quadrature, [soft])
+    x, w = soft.integrate(pieces.points, pieces.weights, pieces.edges, pieces.axes)
     previous = 0.0
     for stiffness in (1e1, 1e3, 1e5):
         springs = mass_matrix(basis.evaluate(x), stiffness * w)

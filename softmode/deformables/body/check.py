@@ -15,6 +15,7 @@ _KINDS = {
     "volume": float,
     "kernel": str,
     "length": float,
+    "envelope_length": float,
     "driven_count": int,
     "region_names": tuple,
     "fingerprint": str,

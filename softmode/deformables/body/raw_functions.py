@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -27,8 +27,8 @@ class RawFunctions(Protocol):
         """Return at which of points (N, 3) within reach the functions can be evaluated, shape (N,)."""
         ...
 
-    def evaluate(self, points: Array) -> tuple[Array, Array]:
-        """Return values (N, R) and gradients [1/m] (N, R, 3) at points within reach."""
+    def evaluate(self, points: Array, at: Array | None = None) -> tuple[Array, Array]:
+        """Return values (N, R) and gradients [1/m] (N, R, 3) within reach; all but the kernels `at` other points."""
         ...
 
 
@@ -54,13 +54,17 @@ class SkinningFunctions:
         """Return at which of points (N, 3) within reach there are enough kernels: not in the gap between two leaves."""
         return self.kernels.covered(points)
 
-    def weights(self, points: Array) -> tuple[Array, Array]:
-        """Return the skinning weights (N, J) and their gradients [1/m] (N, J, 3) at points within reach."""
-        return self.skin.evaluate(*enveloped(self.kernels.evaluate(points), self.envelope))
+    def weights(self, points: Array, at: Array | None = None) -> tuple[Array, Array]:
+        """Return the skinning weights (N, J) and their gradients [1/m] (N, J, 3) at points within reach.
 
-    def evaluate(self, points: Array) -> tuple[Array, Array]:
-        """Return values (N, R) and gradients [1/m] (N, R, 3) at points within reach."""
-        return self.skin.products(*self.weights(points), points, self.length)
+        The envelope and the blends are those `at` other points (N, 3) if these are given.
+        """
+        shape = self.kernels.evaluate(points)
+        return self.skin.evaluate(*enveloped(shape if at is None else replace(shape, points=at), self.envelope))
+
+    def evaluate(self, points: Array, at: Array | None = None) -> tuple[Array, Array]:
+        """Return values (N, R) and gradients [1/m] (N, R, 3) within reach; all but the kernels `at` other points."""
+        return self.skin.products(*self.weights(points, at), points if at is None else at, self.length)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +84,7 @@ class QuadraticFunctions:
         """Return that there are enough kernels at all points (N, 3) within reach: one will do."""
         return np.ones(len(points), dtype=bool)
 
-    def evaluate(self, points: Array) -> tuple[Array, Array]:
+    def evaluate(self, points: Array, at: Array | None = None) -> tuple[Array, Array]:
         """Return values (N, 10 + 10 n) and gradients [1/m] (N, 10 + 10 n, 3) at points within reach."""
         one, flat = np.ones((len(points), 1)), np.zeros((len(points), 1, 3))
         whole = constant_handle(1).products(one, flat, points, self.length)

@@ -38,10 +38,11 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Scalar = str | int | float | bool | None
 
-FORMAT, FORMAT_VERSION = "softmode.ReducedBody", 3
+FORMAT, FORMAT_VERSION = "softmode.ReducedBody", 4
 """Kind and version of a body's file."""
-READABLE = (2, 3)
-"""Versions that are read. Bodies of version 2 have no detours, and keep the functions that they had."""
+READABLE = (2, 3, 4)
+"""Versions that are read. Bodies of version 2 have no detours, those before 4 a wide envelope; all keep the functions
+that they had."""
 _HINT = "build the body again"
 RATIO_HARMLESS = 0.45
 """Poisson's ratio up to which functions made for any other serve."""
@@ -80,7 +81,8 @@ class ReducedBody:
     """Coefficients c (n, 4) with sum_k b_k c_kj = (X, Y, Z, 1)_j for every X."""
     eigenvalues: Array
     """Eigenvalues of the skinning eigenmodes [1/m^2], the constant handle's 0 first, shape (m + 1,); of local handles
-    the mean square of the gradient over that of the weight, likewise."""
+    the mean square of the gradient over that of the weight, likewise. Beside exact regions most modes of functions that
+    are chosen by elastic energy are those of the free body, 0 first again."""
     bounds: Array
     """Corners of the bounding box in the body frame [m], shape (2, 3)."""
     offset: Array
@@ -130,6 +132,9 @@ class ReducedBody:
     """What went in, what was measured, what was lost."""
     build_seconds: float
     """Wall time of the build [s]."""
+    envelope_length: float = 0.0
+    """Distance from exact regions at which the envelope of the functions is one [m]; 0 without such regions, and in
+    files before version 4, whose envelope is d / (d + `length`)."""
     material_points: Array = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
     """Points of the material [m], shape (N, 3); empty where every kernel acts on all within its support."""
     hidden_pairs: Indices = dataclasses.field(default_factory=lambda: np.zeros(0, dtype=np.int64))
@@ -189,7 +194,7 @@ class ReducedBody:
     @cached_property
     def _envelope(self) -> Envelope | None:
         exact = tuple(region for region in self.regions if region.stiffness is None)
-        return Envelope(exact, self.length) if exact else None
+        return Envelope(exact, self.envelope_length or self.length, not self.envelope_length) if exact else None
 
     @cached_property
     def kernels(self) -> BasisRKPM:
@@ -255,7 +260,7 @@ class ReducedBody:
         Raises:
             BasisError: If points are not finite, or out of reach with outside="raise".
         """
-        x, inner, far = self._within_reach(points)
+        x, inner, at, far = self._within_reach(points)
         if outside not in ("clamp", "raise"):
             raise ConfigError(f"outside: expected 'clamp' or 'raise', got {outside!r}")
         if far.any() and outside == "raise":
@@ -266,19 +271,20 @@ class ReducedBody:
         value = np.empty((len(x), self.function_count))
         gradient = np.empty((len(x), self.function_count, 3))
         for i in range(0, len(x), _CHUNK):
-            value[i : i + _CHUNK], gradient[i : i + _CHUNK] = self._evaluate_inside(inner[i : i + _CHUNK])
+            some = slice(i, i + _CHUNK)
+            value[some], gradient[some] = self._evaluate_inside(inner[some], at[some])
         if far.any():
             # The functions' content of (X, Y, Z, 1): rows of the left inverse of the linear coordinates.
             content = np.linalg.solve(self.linear_coordinates.T @ self.linear_coordinates, self.linear_coordinates.T)
-            value[far] += (x[far] - inner[far]) @ content[:3]
-            gradient[far] = content[:3].T
+            value[far] += (x[far] - at[far]) @ content[:3]
+            gradient[far & (x != at).any(axis=1)] = content[:3].T
         return value, gradient
 
     def skinning_weights(self, points: ArrayLike) -> tuple[Array, Array]:
         """Evaluate the skinning weights W_j and their gradients at rest points of the body frame.
 
         With T_j the map that handle j applies, x(X) = X + sum_j W_j(X) T_j(X) for points within the kernels' reach;
-        beyond it the weights are those of the nearest point within.
+        beyond it the weights are those of the nearest point within, but for exact regions, where all is known.
 
         Args:
             points: Rest positions [m], shape (N, 3).
@@ -290,15 +296,20 @@ class ReducedBody:
             BasisError: If points are not finite.
             ConfigError: If the functions are those of Q-GMLS.
         """
-        skinning, inner = self._skinning, self._within_reach(points)[1]
+        skinning, (_, inner, at, _) = self._skinning, self._within_reach(points)
         weight = np.empty((len(inner), len(self.handle_degrees)))
         gradient = np.empty((*weight.shape, 3))
         for i in range(0, len(inner), _CHUNK):
-            weight[i : i + _CHUNK], gradient[i : i + _CHUNK] = skinning.weights(inner[i : i + _CHUNK])
+            weight[i : i + _CHUNK], gradient[i : i + _CHUNK] = skinning.weights(
+                inner[i : i + _CHUNK], at[i : i + _CHUNK]
+            )
         return weight, gradient
 
-    def _within_reach(self, points: ArrayLike) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """Return the points, the nearest ones to them within the kernels' reach, and which differ."""
+    def _within_reach(self, points: ArrayLike) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+        """Return the points, the nearest ones to them within the kernels' reach, and which differ.
+
+        Third the nearest ones where kernels count: in exact regions they vanish, and points are what they are.
+        """
         x = np.asarray(points, dtype=np.float64)
         if x.ndim != 2 or x.shape[1] != 3 or not np.isfinite(x).all():
             raise BasisError(f"points: expected finite positions of shape (N, 3), got shape {x.shape}")
@@ -311,11 +322,14 @@ class ReducedBody:
             bare = bare[~self.raw.covered(inner[bare])]
             inner[bare] = centre[bare] + nearer * (inner[bare] - centre[bare])
             far[bare] = True
-        return x, inner, far
+        at = inner
+        if self._envelope is not None and far.any():
+            at = np.where((far & self._envelope.holds(x))[:, None], x, inner)
+        return x, inner, at, far
 
-    def _evaluate_inside(self, x: Array) -> tuple[Array, Array]:
-        """Evaluate functions (N, n) and gradients (N, n, 3) at points within reach."""
-        raw, raw_gradient = self.raw.evaluate(x)
+    def _evaluate_inside(self, x: Array, at: Array) -> tuple[Array, Array]:
+        """Evaluate functions (N, n) and gradients (N, n, 3) at points within reach; all but the kernels `at` others."""
+        raw, raw_gradient = self.raw.evaluate(x, at)
         gradient = np.stack([raw_gradient[:, :, d] @ self.transform for d in range(3)], axis=2)
         return raw @ self.transform, gradient
 
@@ -434,6 +448,7 @@ class ReducedBody:
         Raises:
             AssetError: If they are not those of a body.
         """
+        header = {"envelope_length": 0.0, **header}
         names = {f.name for f in _own_fields()}
         for table in _TABLES.values():
             if not arrays.keys() & (table - {"material_points"}):

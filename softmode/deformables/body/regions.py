@@ -1,9 +1,11 @@
 """Regions: parts of a body that a scene holds, moves or grasps, known when the body is built.
 
 A region is a box or a set of points, grown by a radius. Its distance d(X), zero inside, makes weights that vanish on
-the region exactly: a smooth function times d / (d + l) is zero inside and leaves the region's face with a kink, as the
-displacement of a clamped body does (Kantorovich and Krylov 1958; Rvachev and Sheiko 1995, doi:10.1115/1.3005099). No
-kernel of finite width can do either.
+the region exactly: a smooth function times g(d), with g = 1 - (1 - d / w)^3 up to w and one beyond, is zero inside and
+leaves the region's face with a kink, as the displacement of a clamped body does (Kantorovich and Krylov 1958; Rvachev
+and Sheiko 1995, doi:10.1115/1.3005099). No kernel of finite width can do either. w is one radius of the kernels: beyond
+it they reproduce linear fields as on a free body. An envelope as wide as the body takes that from them everywhere, and
+a spiral strip was three times too stiff with it.
 """
 
 from __future__ import annotations
@@ -64,6 +66,16 @@ class Region:
         return Region(name=self.name, box=box, points=points, radius=self.radius, stiffness=self.stiffness)
 
     @property
+    def thickness(self) -> float:
+        """Its least extent, of points about along their principal axes [m]."""
+        span = np.asarray(self.box if self.points is None else self.points)
+        if self.points is not None:
+            span = (span - span.mean(axis=0)) @ np.linalg.svd(span - span.mean(axis=0), full_matrices=len(span) < 3)[
+                2
+            ].T
+        return float(np.ptp(span, axis=0).min()) + 2.0 * self.radius
+
+    @property
     def cores(self) -> Array:
         """The box, or the points as boxes of no extent, shape (C, 2, 3)."""
         if self.box is not None:
@@ -91,21 +103,37 @@ class Region:
             gradient = (points - core[nearest]) / np.maximum(found, 1e-300)[:, None]
         return found - self.radius, gradient
 
-    def integrate(self, points: Array, weights: Array, spacing: float) -> tuple[Array, Array]:
+    def cut(self, points: Array, edges: Array, axes: Array) -> tuple[Array, Array, Array, Array]:
+        """Return how the region cuts boxes, as a plane would that is parallel to its face.
+
+        Args:
+            points: Centroids of the boxes [m], shape (P, 3).
+            edges: Their edges along the axes [m], shape (P, 3); zeros of a point.
+            axes: Unit vectors in rows, shape (3, 3).
+
+        Returns:
+            Signed distances of the centroids [m] (P,), normals of the face (P, 3), widths of the boxes along these [m]
+            (P,), and the share of each box that lies inside (P,).
+        """
+        distance, normal = self.distance(points)
+        width = (np.abs(normal @ axes.T) * edges).sum(axis=1)
+        return distance, normal, width, np.clip(0.5 - distance / np.maximum(width, 1e-300), 0.0, 1.0)
+
+    def integrate(self, points: Array, weights: Array, edges: Array, axes: Array) -> tuple[Array, Array]:
         """Return points (N, 3) [m] and volumes (N,) [m^3] that integrate over the region.
 
-        Cells of the quadrature that the face cuts count by the part inside, at its centroid.
+        Boxes that the face cuts count by the part inside, at its centroid.
 
         Args:
             points: Quadrature points [m], shape (P, 3).
             weights: Their volumes [m^3], shape (P,).
-            spacing: Edge of their cells [m].
+            edges: Edges of the boxes that they stand for [m], shape (P, 3); zeros where no face comes near.
+            axes: Axes of the boxes, unit vectors in rows, shape (3, 3).
 
         Raises:
             BasisError: If an exact region holds fewer than four quadrature points, or a soft one none.
         """
-        distance, normal = self.distance(points)
-        share = np.clip(0.5 - distance / spacing, 0.0, 1.0)
+        distance, normal, width, share = self.cut(points, edges, axes)
         found = np.flatnonzero(share > 0.02)
         needed = 4 if self.stiffness is None else 1
         if len(found) < needed:
@@ -113,7 +141,7 @@ class Region:
                 f"region {self.name!r}: holds {len(found)} quadrature points, at least {needed} are needed",
                 hint="Enlarge the region or use more quadrature points; regions are given in asset coordinates.",
             )
-        shift = np.where(np.abs(distance) < 0.5 * spacing, 0.5 * (distance + 0.5 * spacing), 0.0)
+        shift = np.where(np.abs(distance) < 0.5 * width, 0.5 * (distance + 0.5 * width), 0.0)
         return points[found] - (shift[:, None] * normal)[found], weights[found] * share[found]
 
     def corners(self, points: Array, spacing: float) -> Array:
@@ -136,7 +164,13 @@ class Envelope:
     regions: tuple[Region, ...]
     """Exact regions, in the frame of the points to come."""
     length: float
-    """Distance over which the envelope saturates [m]."""
+    """Distance w at which the envelope is one [m]."""
+    wide: bool = False
+    """Whether it is g = d / (d + length) instead, that of bodies in files of version 3 and before."""
+
+    def holds(self, points: Array) -> NDArray[np.bool_]:
+        """Return which points (N, 3) lie in a region, its face included."""
+        return np.any([region.distance(points)[0] <= 0.0 for region in self.regions], axis=0)
 
     def evaluate(self, points: Array) -> tuple[Array, Array, Array, Array]:
         """Evaluate the envelope and the blends.
@@ -145,7 +179,7 @@ class Envelope:
             points: Positions [m], shape (N, 3).
 
         Returns:
-            G = prod_i g_i with g_i = d_i / (d_i + length), zero on every region, (N,), its gradient [1/m] (N, 3);
+            G = prod_i g_i with g_i = 1 - (1 - min(d_i / w, 1))^3, zero on every region, (N,), its gradient (N, 3);
             T_i = (1 / g_i) / sum_j (1 / g_j), one on region i and zero on the others, (N, R), its gradient (N, R, 3).
         """
         count = len(self.regions)
@@ -153,8 +187,13 @@ class Envelope:
         for i, region in enumerate(self.regions):
             distance, normal = region.distance(points)
             distance = np.maximum(distance, 0.0)
-            g[:, i] = distance / (distance + self.length)
-            slope[:, i] = normal * (np.where(distance > 0.0, self.length, 0.0) / (distance + self.length) ** 2)[:, None]
+            if self.wide:
+                g[:, i] = distance / (distance + self.length)
+                steep = self.length / (distance + self.length) ** 2
+            else:
+                rest = 1.0 - np.minimum(distance / self.length, 1.0)
+                g[:, i], steep = 1.0 - rest**3, 3.0 * rest**2 / self.length
+            slope[:, i] = normal * np.where(distance > 0.0, steep, 0.0)[:, None]
         # Products without factor i, and their gradients, free of divisions by a vanishing g.
         others, others_slope = np.ones_like(g), np.zeros_like(slope)
         for i in range(count):

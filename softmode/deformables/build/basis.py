@@ -14,7 +14,13 @@ from softmode.deformables.body.regions import Envelope, Region
 from softmode.deformables.body.rkpm import BasisRKPM, ShapeFunctions, make_basis
 from softmode.deformables.body.skinning_weights import SkinningWeights, constant_handle, enveloped
 from softmode.deformables.build.eigenmodes import Eigenmodes, solve_eigenmodes
-from softmode.deformables.build.elastic_functions import SPACE_ERROR, SPACE_MODE_COUNTS, Held, choose_functions
+from softmode.deformables.build.elastic_functions import (
+    SPACE_ERROR,
+    SPACE_MODE_COUNTS,
+    TURN_COUNT,
+    Held,
+    choose_functions,
+)
 from softmode.deformables.build.functions import (
     HELD_RANK_TOLERANCE,
     TRACE_TOLERANCE,
@@ -27,7 +33,7 @@ from softmode.deformables.build.functions import (
 from softmode.deformables.build.galerkin import mass_matrix
 from softmode.deformables.build.local_handles import gather_at_lips, gather_weights, place_kernels
 from softmode.deformables.build.octants import Octants
-from softmode.deformables.build.options import EIGENMODE_COUNT, BuildOptions
+from softmode.deformables.build.options import EIGENMODE_COUNT, KERNEL_LEAST, BuildOptions
 from softmode.deformables.build.region_samples import RegionSamples, drive_matrices, rigid_motions
 from softmode.deformables.build.static_response import lame_parameters, solve_harmonic_weights, solve_static_responses
 from softmode.deformables.build.visibility import Material, divide_at_gaps
@@ -35,6 +41,14 @@ from softmode.errors import ConfigError
 
 Array = NDArray[np.float64]
 
+SWUNG_COUNT = 16
+"""Eigenmodes of the held body among those of the space, where exact regions move against each other: without them a
+beam twisted by 720 degrees has twice the error."""
+KERNEL_MODES = 12
+"""Elastic modes of the kernels, translations of which join the space of a held body."""
+KERNEL_EDGE = 1.3
+"""Kernels of held bodies are no narrower than so many of the longest edges of octants: with 6 mm on octants of 6 mm a
+plate gave way in its plane 4 % too far, between the points."""
 LIP_COUNT = 20
 """Handles along the lips of slits, among the space that functions are chosen from. Eigenmodes resolve a slit slowly:
 48, 64, 96 and 128 of them each lower the first frequency of a slit plush, by 2 to 3 %."""
@@ -60,6 +74,8 @@ class Domain:
     """Points among which kernel centres are chosen [m], shape (S, 3)."""
     spacing: float
     """Spacing of the seeds [m]."""
+    edge: float
+    """Longest edge of an octant [m]."""
     length: float
     """Unit of length [m]."""
     regions: tuple[Region, ...]
@@ -75,11 +91,10 @@ class Domain:
     lips: Array
     """Points on both sides of slits [m], shape (N, 3)."""
 
-    @property
-    def envelope(self) -> Envelope | None:
-        """The envelope of the exact regions, if any."""
+    def envelope(self, kernels: BasisRKPM) -> Envelope | None:
+        """Return the envelope of the exact regions, if any: one kernel radius wide."""
         exact = tuple(region for region in self.regions if region.stiffness is None)
-        return Envelope(exact, self.length) if exact else None
+        return Envelope(exact, float(np.median(kernels.radii))) if exact else None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,6 +115,8 @@ class BodyBasis:
     """Driven coordinates from displacements of the region samples, shape (r, N)."""
     drive_affine: Array
     """Driven coordinates from affine motions of the regions, shape (R, r, 4)."""
+    envelope_length: float
+    """Width of the envelope of exact regions [m], or 0."""
     report: dict[str, float]
     """What the choice of the functions says of itself."""
 
@@ -141,6 +158,8 @@ class _Ground:
     """Kernels at the quadrature points, and what regions ask of the weights."""
 
     kernels: BasisRKPM
+    envelope: Envelope | None
+    plain: ShapeFunctions
     shape: ShapeFunctions
     blend: Array
     blend_slope: Array
@@ -153,16 +172,24 @@ class _Ground:
 
 def _ground(domain: Domain, options: BuildOptions) -> _Ground:
     """Return the kernels of a domain and the weights of its regions."""
-    count = options.kernels(len(domain.seeds), held=bool(domain.regions))
+    count = options.kernels(len(domain.seeds))
     kernels = make_basis(domain.seeds, count, kernel=options.kernel, spacing=domain.spacing, seed=options.seed)
+    few = KERNEL_LEAST if domain.regions and options.kernel_count is None else count
+    while count > few and np.median(kernels.radii) < KERNEL_EDGE * domain.edge:
+        count = max(count * 4 // 5, KERNEL_LEAST)
+        kernels = make_basis(domain.seeds, count, kernel=options.kernel, spacing=domain.spacing, seed=options.seed)
     if domain.material is not None:
         kernels = divide_at_gaps(kernels, domain.material, domain.seeds, domain.spacing, domain.octants)
-    shape, blend, blend_slope = enveloped(kernels.evaluate(domain.points), domain.envelope)
-    springs, pull = _springs(kernels, domain)
+    envelope = domain.envelope(kernels)
+    plain = kernels.evaluate(domain.points)
+    shape, blend, blend_slope = enveloped(plain, envelope)
+    springs, pull = _springs(kernels, envelope, domain)
     mu, lame = lame_parameters(_mean_ratio(options))
     scalar = 1.0 / (lame + 4.0 * mu)
     return _Ground(
         kernels=kernels,
+        envelope=envelope,
+        plain=plain,
         shape=shape,
         blend=blend,
         blend_slope=blend_slope,
@@ -176,14 +203,28 @@ def _ground(domain: Domain, options: BuildOptions) -> _Ground:
 
 def _modes(ground: _Ground, domain: Domain, options: BuildOptions, count: int) -> Eigenmodes:
     """Return a number of eigenmodes, and handles along the lips of slits after them."""
-    found = solve_eigenmodes(
-        ground.shape,
-        domain.volumes,
-        count,
-        stiffness_scale=domain.stiffness,
-        springs=None if ground.springs is None else ground.scalar * ground.springs,
-        vanishing=domain.envelope is not None,
-    )
+    envelope, apart = ground.envelope, 0
+    if envelope is not None and options.chosen:
+        apart = min(SWUNG_COUNT, count // 3) if len(envelope.regions) > 1 else 0
+    found = Eigenmodes(coefficients=np.ones((ground.shape.centre_count, 1)), eigenvalues=np.zeros(1))
+    if envelope is None or apart or not options.chosen:
+        found = solve_eigenmodes(
+            ground.shape,
+            domain.volumes,
+            apart or count,
+            stiffness_scale=domain.stiffness,
+            springs=None if ground.springs is None else ground.scalar * ground.springs,
+            vanishing=envelope is not None,
+        )
+    if len(found.eigenvalues) <= count:
+        # Times the envelope, which takes from modes of the free body what they have at the faces, and no more: modes of
+        # the held one rise slowly, and a plate 50:1 of nu = 0.49 was 17 % too stiff where it bends most.
+        rest = count - len(found.eigenvalues)
+        free = solve_eigenmodes(ground.plain, domain.volumes, rest, stiffness_scale=domain.stiffness)
+        found = Eigenmodes(
+            coefficients=np.concatenate([found.coefficients, free.coefficients], axis=1),
+            eigenvalues=np.concatenate([found.eigenvalues, free.eigenvalues]),
+        )
     if not (options.chosen and len(domain.lips)):
         return found
     return _with_handles(found, gather_at_lips(ground.kernels, domain.lips, LIP_COUNT), ground, domain)
@@ -247,7 +288,7 @@ def _basis(
 ) -> BodyBasis:
     """Return the basis of eigenmodes or local handles: the handles themselves, or the space of the functions."""
     kernels, shape, blend, blend_slope = ground.kernels, ground.shape, ground.blend, ground.blend_slope
-    envelope, points, springs = domain.envelope, domain.points, ground.springs
+    envelope, points, springs = ground.envelope, domain.points, ground.springs
     stage("eigenmodes")
     skin = _weights(domain, options, modes.coefficients, ground.region_weights, shape, blend_slope.shape[1], springs)
     stage("responses")
@@ -315,6 +356,12 @@ def _chosen(
     soft = (skin.owner > 0) & (skin.owner < len(domain.regions))
     others = np.setdiff1d(np.flatnonzero(~soft), leading)
     first_mode, mode_count = max(1, len(domain.regions)), len(modes.eigenvalues) - 1 - modes.local_count
+    turned, level = np.zeros(0, dtype=np.intp), np.zeros(0)
+    if motions.shape[1] and not options.local:
+        turned = np.flatnonzero(
+            (skin.owner >= first_mode) & (skin.owner < first_mode + TURN_COUNT) & (skin.monomial < 4)
+        )
+        level = np.sqrt(modes.eigenvalues[1] / modes.eigenvalues[1 + skin.owner[turned] - first_mode])
     late = (skin.owner >= first_mode + mode_count // 2) & (skin.owner < first_mode + mode_count)
     chosen = choose_functions(
         *fields,
@@ -323,7 +370,9 @@ def _chosen(
         others=others,
         half=None if options.local else others[~late[others]],
         quadratic=np.arange(10) if trace is None else None,
-        held=Held(driven=driven, motions=motions, springs=springs) if domain.regions else None,
+        held=Held(driven=driven, motions=motions, springs=springs, turned=turned, level=level)
+        if domain.regions
+        else None,
         count=options.function_count,
         accuracy=options.accuracy,
         poissons_ratios=options.poissons_ratios,
@@ -357,6 +406,7 @@ def _finished(
     """
     driven = np.zeros((0, 0)) if trace is None else trace @ functions.transform[:, : functions.driven_count]
     drive, drive_affine = drive_matrices(domain.samples, driven, len(domain.regions))
+    envelope = None if isinstance(kernels, BasisQGMLS) else domain.envelope(kernels)
     return BodyBasis(
         kernels=kernels,
         weights=skin,
@@ -365,6 +415,7 @@ def _finished(
         gradient=np.stack([raw_gradient[:, :, d] @ functions.transform for d in range(3)], axis=2),
         drive=drive,
         drive_affine=drive_affine,
+        envelope_length=0.0 if envelope is None else envelope.length,
         report=report,
     )
 
@@ -374,12 +425,12 @@ def _mean_ratio(options: BuildOptions) -> float:
     return sum(options.poissons_ratios) / len(options.poissons_ratios)
 
 
-def _springs(kernels: BasisRKPM, domain: Domain) -> tuple[Array | None, Array | None]:
+def _springs(kernels: BasisRKPM, envelope: Envelope | None, domain: Domain) -> tuple[Array | None, Array | None]:
     """Return what soft regions add, per E: springs [m] (K, K), and their pull on the weights of regions [m] (K, R).
 
     Columns of the pull: exact regions first, then soft ones, as `solve_harmonic_weights` wants them.
     """
-    samples, envelope = domain.samples, domain.envelope
+    samples = domain.samples
     soft = np.flatnonzero(~samples.exact)
     if not len(soft):
         return None, None
@@ -445,6 +496,7 @@ def _weights(
             stiffness_scale=domain.stiffness,
             springs=springs,
             derivative_count=0 if options.chosen else options.response_derivatives,
+            mode_count=KERNEL_MODES if options.chosen else 0,
         )
         parts.append(responses)
         degrees += [0] * responses.shape[1]

@@ -20,10 +20,11 @@ from softmode.deformables.body.rkpm import BasisRKPM
 from softmode.deformables.build.basis import BodyBasis, Domain, make_body_basis
 from softmode.deformables.build.cache import cache_directory, cached_body, fingerprint_of
 from softmode.deformables.build.cubature import Cubature, select_cubature
+from softmode.deformables.build.elastic_functions import SPACE_WARNING
 from softmode.deformables.build.octants import octants_of
-from softmode.deformables.build.options import BuildOptions, HandleName
+from softmode.deformables.build.options import FUNCTION_COUNT, BuildOptions, HandleName
 from softmode.deformables.build.quadrature_grid import Quadrature
-from softmode.deformables.build.region_samples import octants_near, refine_at_faces, sample_regions
+from softmode.deformables.build.region_samples import longest_edge, pieces_near, refine_at_faces, sample_regions
 from softmode.deformables.build.sources import Sources, pack_sources
 from softmode.deformables.build.visibility import lips_of, material_of
 from softmode.errors import MaterialError, memory_errors
@@ -44,6 +45,10 @@ Progress = Callable[[str, float], None]
 Field = ArrayLike | Callable[[Array], ArrayLike]
 """One value per quadrature point, or a function of points (N, 3) [m] in asset coordinates."""
 
+FREE_VERSION = 3
+"""Version of the format since which bodies without regions are what they are: live recordings name them by it."""
+NU_LIMIT = 0.495
+"""Poisson's ratio from which on the default number of functions is said to be too small."""
 _PROGRESS = {"kernels": 0.1, "eigenmodes": 0.2, "responses": 0.35, "functions": 0.45, "cubature": 0.95, "surface": 1.0}
 """Fraction of a build that is done after each stage."""
 
@@ -140,16 +145,17 @@ def _build(
         stiffness_scale=None if stiffness_scale is None else stiffness,
         density_scale=None if density_scale is None else density,
     )
-    places, weights, parent = octants_near(quadrature, regions)
-    stiffness, density = stiffness[parent], density[parent]
+    pieces = pieces_near(quadrature, regions)
+    places, weights = pieces.points, pieces.weights
+    stiffness, density = stiffness[pieces.parent], density[pieces.parent]
     density = density * (quadrature.volume / (weights @ density))
     mass = weights * density / quadrature.volume
     offset = mass @ places
     seeds, bounds = places - offset, quadrature.bounds - offset
     length = float(np.sqrt(mass @ (seeds**2).sum(axis=1)))
     regions = tuple(region.moved(offset, bounds) for region in regions)
-    samples = sample_regions(regions, seeds, weights, stiffness, quadrature.spacing)
-    points, volumes, parent = refine_at_faces(regions, seeds, weights, quadrature.spacing)
+    samples = sample_regions(regions, pieces, offset, stiffness, quadrature.spacing)
+    points, volumes, parent = refine_at_faces(regions, pieces, offset)
     stiffness = stiffness[parent]
     seconds: dict[str, float] = {}
     with _reporter(progress, name) as report:
@@ -166,6 +172,7 @@ def _build(
                 density=density[parent],
                 seeds=seeds,
                 spacing=quadrature.spacing,
+                edge=longest_edge(quadrature),
                 length=length,
                 regions=regions,
                 samples=samples,
@@ -178,6 +185,8 @@ def _build(
             stage,
             quick=quick,
         )
+        if not quick:
+            _warn_of_stiffness(name, basis, options)
         chosen = _cubature(volumes, basis, stiffness, options, quick=quick)
         stage("cubature")
         function_count = basis.gradient.shape[1]
@@ -207,6 +216,7 @@ def _build(
             transform=basis.functions.transform,
             length=length,
             driven_count=basis.functions.driven_count,
+            envelope_length=basis.envelope_length,
             region_names=tuple(region.name for region in regions),
             region_stiffness=np.array([region.stiffness or 0.0 for region in regions], dtype=np.float64),
             region_radii=np.array([region.radius for region in regions], dtype=np.float64),
@@ -248,6 +258,29 @@ def _build(
     )
 
 
+def _warn_of_stiffness(name: str, basis: BodyBasis, options: BuildOptions) -> None:
+    """Say what makes a body too stiff.
+
+    Warns:
+        RuntimeWarning: If its kernels do not resolve it, or its Poisson's ratio wants more functions.
+    """
+    space, ratio = basis.report.get("space_error", 0.0), max(options.poissons_ratios)
+    if space > SPACE_WARNING:
+        warnings.warn(
+            f"body {name!r}: space_error {100.0 * space:.0f} %: its first six frequencies may be that much too high, by"
+            " corners, branches or thin walls that its kernels do not resolve; build it with twice the points",
+            RuntimeWarning,
+            stacklevel=4,
+        )
+    if options.chosen and ratio > NU_LIMIT and (options.function_count or FUNCTION_COUNT) <= FUNCTION_COUNT:
+        warnings.warn(
+            f"body {name!r}: {FUNCTION_COUNT} functions are up to 4 % too stiff at nu = {ratio:g};"
+            " give function_count=80",
+            RuntimeWarning,
+            stacklevel=4,
+        )
+
+
 def body_fingerprint(
     quadrature: Quadrature,
     options: BuildOptions,
@@ -257,7 +290,8 @@ def body_fingerprint(
     density: Array,
 ) -> str:
     """Return the fingerprint of all that a body is built from; stiffness and density are relative, one per point."""
-    return fingerprint_of(FORMAT_VERSION, quadrature, options, name, list(regions), stiffness, density)
+    version = FORMAT_VERSION if regions else FREE_VERSION
+    return fingerprint_of(version, quadrature, options, name, list(regions), stiffness, density)
 
 
 def _cubature(volumes: Array, basis: BodyBasis, stiffness: Array, options: BuildOptions, *, quick: bool) -> Cubature:

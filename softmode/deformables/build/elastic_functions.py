@@ -11,12 +11,15 @@ out 3.4 times too stiff. Here the functions are chosen for elasticity itself, ou
 3. The choice: the three components of every target, each target at unit energy and weighted by w = min(1, omega_1^2 /
    omega^2), are columns of one matrix. Its singular vectors in gradient energy come in the order of what they carry.
 
-On a body with regions the space vanishes on the exact ones, and the functions that carry their motion come first. Then
+On a body with exact regions the space is made of eigenmodes of the free body times an envelope that vanishes there, and
+on one with any regions also of translations along static responses and elastic modes of the kernels, which know how a
+section warps. The functions that carry the regions' motion come first. Then
 come the static responses to unit body forces, kept exactly: what eigenmodes lack in a response is small but decides its
 energy. The targets are the elastic modes of the held body, the second order of the static responses at a turn of half a
 radian, and the constraint modes of exact regions that move against each other (Craig and Bampton 1968,
 doi:10.2514/3.4741). Weights are w = min(1, omega_1 / omega): a turn between two clamps is far from what linear modes
-say, and wants higher ones. With omega^2 a beam that is twisted by 720 degrees has ten times the error.
+say, and wants higher ones. With omega^2 a beam that is twisted by 720 degrees has ten times the error. Such a turn also
+wants products of slow functions with affine motion, which are targets too; the first modes then weigh as much as these.
 
 The functions of a smaller count are the first of a larger one, so that more functions never make a body stiffer. The
 choice is the one of modal substructuring with all components taken apart (von Tycowicz et al. 2013,
@@ -45,17 +48,26 @@ SPACE_MODE_COUNTS = 48, 96
 too stiff with 48 and 1.5 % with 96, for three times the time."""
 SPACE_ERROR = 0.02
 """The space is made larger where its second half lowers one of the first six frequencies by more than this."""
+SPACE_WARNING = 0.05
+"""A build says so where the space is not settled by more than this; so does the report of a body."""
 TARGET_COUNT = 40
 """Elastic modes among the targets; it does not depend on the number of functions, or these would not be nested."""
 JUDGED_COUNT = 6
 """The error of a choice is that of the first so many frequencies."""
-SPACE_TOLERANCE = 1e-9
-"""Directions of the scaled mass Gram matrix of the space under this fraction of the largest are rounding."""
+SPACE_TOLERANCE, HELD_SPACE_TOLERANCE = 1e-9, 1e-11
+"""Directions of the scaled mass Gram matrix of the space under this fraction of the largest are rounding. On a body
+with regions a function of little mass may decide the energy: a spiral strip was 5 % too stiff with the first."""
 NEGLIGIBLE = 1e-13
 """Singular vectors under this fraction of the largest energy are rounding."""
 EQUAL = 0.95
 """Singular vectors whose energies are nearer than this contribute alike: symmetric bodies have clusters of them. Those
 of a star differ by 4 % at most within a cluster and by 6 % and more between two."""
+TURN_COUNT, TURN_LEVEL = 6, 3.0
+"""Where exact regions move against each other, targets are also the first so many eigenmodes times affine motion, those
+of the first so many times unit energy. A twist by theta(x) is cos theta y and sin theta z, of which linear modes hold
+the first order: a beam turned by 720 degrees has three times the error without them."""
+TURN_MODES = 5
+"""So many elastic modes then weigh as many times more, or a plate held at two edges has its fourth 10 % too high."""
 AMPLITUDE = 0.25
 """Half the angle [rad] through which a body turns where static responses of first and second order weigh alike."""
 BLOCK, BLOCK_STEPS = 16, 12
@@ -74,6 +86,10 @@ class Held:
     """Rigid motions of every exact region in the driven functions, shape (3 r, M); M = 0 for fewer than two."""
     springs: Array
     """Raw functions at points of soft regions, times the root of kappa V_p / (E V) [1/m], shape (S, R)."""
+    turned: NDArray[np.intp]
+    """Raw functions that are slow functions times affine motion, shape (T,); none for fewer than two exact regions."""
+    level: Array
+    """What each of these is to weigh, shape (T,)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -223,7 +239,10 @@ class _ElasticSpace:
         value *= sign
         transform = lead @ np.linalg.inv(upper * sign[:, None])
         counts = [lead.shape[1]]
-        for index, tolerance in ((kept, KEPT_TOLERANCE), (others, SPACE_TOLERANCE)):
+        for index, tolerance in (
+            (kept, KEPT_TOLERANCE),
+            (others, SPACE_TOLERANCE if held is None else HELD_SPACE_TOLERANCE),
+        ):
             if not len(index):
                 counts.append(counts[-1])
                 continue
@@ -267,6 +286,9 @@ class _ElasticSpace:
             self.energy = self.energy + self.springs
             self.mean = self.transform.T @ (raw.T @ mass)
             self.slopes, self.stiff = [raw_gradient[:, :, d] for d in range(3)], stiff
+            turned = self.transform.T @ (raw.T @ (mass[:, None] * raw[:, held.turned]))
+            turned *= TURN_LEVEL * held.level / np.sqrt(np.einsum("ak,ab,bk->k", turned, self.energy, turned))
+            self.turned = np.concatenate([turned, np.zeros((2 * self.count, turned.shape[1]))])
 
     def order(
         self, fields: Array | None, poissons_ratios: tuple[float, ...], count: int
@@ -288,12 +310,14 @@ class _ElasticSpace:
             share = np.minimum(1.0, first / np.maximum(value, floor))
             if self.held is not None:
                 share = np.sqrt(share)  # What regions drive far from rest wants higher modes.
+                if self.turned.shape[1]:
+                    share[:TURN_MODES] *= TURN_LEVEL
             targets.append(target * (share / np.sqrt(np.maximum(value, floor))))
         blocks = []
         if self.held is not None:
             responses, more = self._responses(self.held, sum(poissons_ratios) / len(poissons_ratios))
             blocks.append(responses)
-            targets.append(more)
+            targets += [more, self.turned]
         found, shares = np.eye(self.count, self.fixed), np.full(self.fixed, np.inf)
         for block in [*blocks, np.concatenate(targets, axis=1)]:
             found, share = self._extend(found, block, count)
@@ -353,7 +377,10 @@ class _ElasticSpace:
         load, turn = second_order_load(self.slopes, self.stiff, raw, poissons_ratio)
         reduced = np.einsum("rv,arp->avp", self.transform, load.reshape(3, len(self.transform), -1))
         i, j = np.triu_indices(3)
-        more = [AMPLITUDE * np.sqrt(turn[i] * turn[j]) * linalg.cho_solve(factor, reduced.reshape(len(first), -1))]
+        load = AMPLITUDE * np.sqrt(turn[i] * turn[j]) * reduced.reshape(len(first), -1)
+        second = linalg.cho_solve(factor, load)
+        # Of unit energy at most: of a plate, whose plane is stiff, they would leave no room for modes.
+        more = [second / np.sqrt(np.maximum(np.einsum("ak,ak->k", second, load), 1.0))]
         if held.motions.shape[1]:
             # Constraint modes: the body's answer to rigid motions of its exact regions, as Ritz modes of unit energy.
             whole, free = elastic_stiffness(self.products, poissons_ratio), np.zeros(3 * self.products.shape[1], bool)

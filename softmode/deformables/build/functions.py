@@ -147,7 +147,11 @@ def driven_first(
     for _ in range(2):
         driven = driven - free @ (free.T @ (weighted.T @ (raw @ driven)))
     transform = np.concatenate([orthonormal_in_mass(driven, raw, mass), free], axis=1)
-    linear = transform.T @ (weighted.T @ raw[:, leading[:4]]) * [length, length, length, 1.0]
+    values, fields = raw @ transform, raw[:, leading[:4]]
+    linear = np.zeros((values.shape[1], 4))
+    for _ in range(2):  # The second pass repairs rounding.
+        linear += values.T @ (mass[:, None] * (fields - values @ linear))
+    linear *= [length, length, length, 1.0]
     return Functions(transform=transform, mean=linear[:, 3].copy(), linear=linear, driven_count=driven.shape[1])
 
 

@@ -78,9 +78,9 @@ class BuildOptions:
     kernel_count: int | None = None
     """Reproducing kernels. None takes 1000 where functions are chosen by elastic energy: corners and crossings need
     them (a cross is 7 % too stiff with 400, 4 % with 1000). FreeForm's functions take 400, which give the first 16
-    eigenvalues of a box to 0.3 %. Below 4,000 quadrature points None takes a fifth of them at most, with regions always
-    an eighth: kernels that are narrower move between the points and cost no energy (a bar of 1,000 points and 1,000
-    kernels was 38 % too soft, with 200 kernels it is 2.5 %)."""
+    eigenvalues of a box to 0.3 %. Below 4,000 quadrature points None takes a fifth of them at most, and with regions
+    fewer where kernels would be narrower than 1.3 cells: these move between the points and cost no energy (a bar of
+    1,000 points and 1,000 kernels was 38 % too soft, with 200 kernels it is 2.5 %)."""
     kernel: KernelName = "cubic"
     """Bell of the reproducing kernels."""
     static_responses: bool = True
@@ -175,13 +175,13 @@ class BuildOptions:
         count = None if self.accuracy is not None else (self.function_count or FUNCTION_COUNT) * 5 // 4
         return replace(self, poissons_ratio=VARIED_RATIOS, function_count=count)
 
-    def kernels(self, point_count: int, *, held: bool) -> int:
-        """Return how many kernels a body of so many quadrature points has, `held` if it has regions."""
+    def kernels(self, point_count: int) -> int:
+        """Return how many kernels a body of so many quadrature points has at most."""
         if self.kernel_count is not None:
             return self.kernel_count
         most = KERNEL_COUNT if self.chosen or self.local else EIGENMODE_KERNEL_COUNT
-        few = max(point_count // (8 if held else 5), KERNEL_LEAST)
-        return most if point_count >= MANY_POINTS and not held else min(most, few)
+        few = max(point_count // 5, KERNEL_LEAST)
+        return most if point_count >= MANY_POINTS else min(most, few)
 
     def cubature_trials(self, point_count: int) -> tuple[tuple[int, int], ...]:
         """Return numbers of cubature points and training poses to try in turn, of so many quadrature points."""

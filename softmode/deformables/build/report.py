@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from softmode.deformables.build.cubature import POISSON_RATIO
+from softmode.deformables.build.elastic_functions import SPACE_WARNING
 from softmode.deformables.build.functions import RANK_TOLERANCE
 from softmode.deformables.build.interior import Interior, interior_from_quadrature, interior_from_surface
 from softmode.deformables.build.occupancy import KEPT_EXTENT, KEPT_SHARE
@@ -33,10 +34,8 @@ STRAIN = 0.1
 """Strain (root mean square over the body) at which the Jacobian of a mode is measured."""
 CONDITION_WARNING = 1e6
 """Condition number of a moment matrix from which on gradients lose more digits than float32 has to spare."""
-KERNEL_POINTS, REGION_POINTS = 3, 8
-"""Quadrature points for every kernel below which a body may be too soft. On a body with regions static responses use
-all kernels: a clamped beam of 5,000 points bends with an error of 1e-6 (nMSE) with 600 kernels, and of 2.5e-3 with
-1,000."""
+KERNEL_POINTS = 3
+"""Quadrature points for every kernel below which a body may be too soft."""
 FREQUENCY_WARNING = 0.05
 """Error of the first frequencies, against the space that functions are chosen from, above which a body is too stiff."""
 SLENDER = 0.3
@@ -249,7 +248,7 @@ def _check_geometry(body: ReducedBody, notes: _Notes) -> None:
     spread = np.sqrt(np.linalg.eigvalsh(np.cov(body.surface_points.T)))
     slender = notes.measure("slenderness", spread[0] / spread[-1])
     points, kernels = body.provenance.get("quadrature_count"), len(body.centres)
-    if isinstance(points, int) and kernels * (REGION_POINTS if body.region_names else KERNEL_POINTS) > points:
+    if isinstance(points, int) and kernels * KERNEL_POINTS > points:
         notes.find(
             "warning",
             "kernels",
@@ -266,7 +265,7 @@ def _check_geometry(body: ReducedBody, notes: _Notes) -> None:
             "build it with --accuracy 0.03, or more --functions",
         )
     space = float(body.provenance.get("space_error") or 0.0)
-    if notes.measure("second half of the space", space) > FREQUENCY_WARNING:
+    if notes.measure("second half of the space", space) > SPACE_WARNING:
         notes.find(
             "warning",
             "space",

@@ -14,7 +14,7 @@ from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.body.regions import Region
 from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.build.quadrature_grid import Cells, Quadrature
-from softmode.deformables.build.region_samples import octants_near, refine_at_faces
+from softmode.deformables.build.region_samples import pieces_near, refine_at_faces
 from softmode.errors import AssetError, ConfigError
 
 Array = NDArray[np.float64]
@@ -96,10 +96,9 @@ def mass_points(body: ReducedBody) -> tuple[Array, Array]:
     if not body.sources:
         return body.points, body.weights
     given = unpack_sources(body)
-    places, weights, parent = octants_near(given.quadrature, given.regions)
-    if given.density_scale is not None:
-        weights = weights * given.density_scale[parent]
-    return refine_at_faces(body.regions, places - body.offset, weights, given.quadrature.spacing)[:2]
+    pieces = pieces_near(given.quadrature, given.regions)
+    points, volumes, parent = refine_at_faces(body.regions, pieces, body.offset)
+    return points, volumes if given.density_scale is None else volumes * given.density_scale[pieces.parent[parent]]
 
 
 def _split(value: Quadrature | Cells) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:

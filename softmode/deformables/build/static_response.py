@@ -24,6 +24,10 @@ from softmode.errors import BasisError
 
 Array = NDArray[np.float64]
 
+MODE_SPARE, MODE_STEPS = 8, 5
+"""Vectors beside the modes asked for, and steps of inverse iteration: they serve as weights, not as frequencies."""
+MODE_LEAST = 1e-3
+"""Components of modes under this fraction of the largest are dropped."""
 NEGLIGIBLE = 1e-6
 """A response under this fraction of the largest is rounding, not physics, and is dropped."""
 
@@ -43,6 +47,7 @@ def solve_static_responses(
     stiffness_scale: Array,
     springs: Array | None = None,
     derivative_count: int = 0,
+    mode_count: int = 0,
 ) -> Array:
     """Solve elasticity for unit body forces along the axes, to first and second order.
 
@@ -54,9 +59,12 @@ def solve_static_responses(
         stiffness_scale: Relative Young's modulus, shape (P,).
         springs: sum_r kappa / E V_r phi phi^T [m] of soft regions, shape (K, K).
         derivative_count: How many second-order weights to keep, 0..18.
+        mode_count: Elastic modes of the kernels, whose components serve as weights too. They know the warping of a
+            section that a bar needs to be twisted: products of smooth weights with quadratic motion do not.
 
     Returns:
-        Coefficients of up to nine weights, then up to `derivative_count`, each of unit mean square, shape (K, .).
+        Coefficients of up to nine weights, three for each mode, then up to `derivative_count`, each of unit mean
+        square, shape (K, .).
 
     Raises:
         BasisError: If nothing holds the body.
@@ -73,6 +81,10 @@ def solve_static_responses(
     mass, energy = mass_and_gradient_matrix(shape, weights / weights.sum(), stiff)
     size = np.sqrt(np.einsum("ik,kl,il->i", first, mass, first, optimize=True))
     parts = [first[size > NEGLIGIBLE * size.max()]]
+    if mode_count:
+        modes = _modes(solve, mass, mode_count).reshape(3, count, -1).transpose(2, 0, 1).reshape(-1, count)
+        part = np.sqrt(np.einsum("ik,kl,il->i", modes, mass, modes, optimize=True))
+        parts.append(modes[part > MODE_LEAST * part.max()])
     if derivative_count:
         load = second_order_load(shape.gradient, stiff, response.T.reshape(3, 3, count), poissons_ratio)[0]
         second = solve(load).reshape(3, count, -1).transpose(2, 0, 1).reshape(-1, count)
@@ -87,6 +99,20 @@ def solve_static_responses(
         parts.append(found * np.sign(found[np.arange(len(found)), np.abs(found).argmax(axis=1)])[:, None])
     found = np.concatenate(parts)
     return (found / np.sqrt(np.einsum("ik,kl,il->i", found, mass, found, optimize=True))[:, None]).T
+
+
+def _modes(solve: Callable[[Array], Array], mass: Array, mode_count: int) -> Array:
+    """Return about the first elastic modes, (3 K, mode_count), by inverse iteration in a block."""
+
+    def weighed(vectors: Array) -> Array:
+        return np.einsum("kl,alm->akm", mass, vectors.reshape(3, len(mass), -1), optimize=True).reshape(vectors.shape)
+
+    found = np.random.default_rng(0).normal(size=(3 * len(mass), mode_count + MODE_SPARE))
+    for _ in range(MODE_STEPS):
+        found = np.linalg.qr(solve(weighed(found)))[0]
+    load = weighed(found)
+    turn = linalg.eigh(load.T @ solve(load), found.T @ load, check_finite=False)[1]
+    return np.asarray(found @ turn[:, : -mode_count - 1 : -1])
 
 
 def second_order_load(
