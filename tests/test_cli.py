@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +20,10 @@ from PIL import Image
 import softmode
 from softmode.cli.main import main
 from softmode.cli.plain import plain_output
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_capsule
 from softmode.envs.markers import dots
 from softmode.splats import make_plush, write_ply, write_splats
 from softmode.viz.film import Film
+from tests.bodies import cube
 
 ROOT = Path(__file__).resolve().parents[1]
 os.environ.setdefault("SOFTMODE_CACHE", str(ROOT / ".cache" / "softmode"))
@@ -180,8 +179,7 @@ def test_no_name_from_a_file_steers_the_terminal(tmp_path: Path, capsys: pytest.
     """Escapes, controls and turned text in a body's name are shown, not obeyed; an error's colours are not lost."""
     name = "toy\x1b]0;title\x07\x1b[8m\r\x9b2J\u202e"
     file = tmp_path / "toy.npz"
-    quadrature = quadrature_from_capsule(0.02, 0.02, point_count=600, surface_count=60)
-    build_body(quadrature, BuildOptions(mode_count=4, kernel_count=80, cubature_count=48), name=name).save(file)
+    replace(cube(), name=name).save(file)
     code = main(["body", "check", str(file)])
     out = capsys.readouterr().out
     assert code in (0, 1, 2) and "toy?]0;title??[8m??2J?" in out

@@ -175,7 +175,7 @@ def _field_of(value: Any, hint: Any, before: Any) -> Any:
         inner = next((a for a in arguments if typing.get_origin(a) is tuple), hint)
         parts = [part for one in typing.get_args(inner) for part in (one, *typing.get_args(one))]  # of unions too
         kinds = [kind for kind in parts if dataclasses.is_dataclass(kind)]
-        return tuple(_field_of(part, kinds[0] if kinds else None, None) for part in value)
+        return tuple(_field_of(x, kinds[0] if kinds and type(x) not in parts else None, None) for x in value)
     return value
 
 
