@@ -74,6 +74,7 @@ def test_a_seeded_reset_leaves_nothing_of_before(lift: LiftSoftEnv) -> None:
     Where the body was before, and its Hessian, are not read in the first step: `dt_before` and `cached` say so. A step
     writes actions and reward first.
     """
+    assert isinstance(lift.action_space, gym.spaces.Box)
     lift.reset(seed=5)
     first = lift.get_state()
     for _ in range(3):

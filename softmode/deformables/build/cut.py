@@ -28,6 +28,7 @@ from softmode.deformables.build.octants import components, touching
 from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.build.patch import Patch
 from softmode.deformables.build.quadrature_grid import Cells, Quadrature
+from softmode.deformables.build.region_samples import pieces_near
 from softmode.deformables.build.sources import Sources, unpack_sources
 from softmode.errors import BasisError, ConfigError
 
@@ -261,11 +262,11 @@ class _Cutter:
 
     def _regions(self, quadrature: Quadrature) -> list[Region]:
         """Return the regions that a part holds enough of."""
-        found, cells = [], quadrature.cells
-        assert cells is not None
+        found = []
         for region in self.given.regions:
+            pieces = pieces_near(quadrature, [region])
             try:
-                region.integrate(cells.octants, cells.weights, quadrature.spacing)
+                region.integrate(pieces.points, pieces.weights, pieces.edges, pieces.axes)
             except BasisError:
                 continue
             found.append(region)
