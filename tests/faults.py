@@ -21,6 +21,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 FULL_DISK = """
 import resource, signal, sys
+sys.dont_write_bytecode = True  # Python 3.11 leaves a cut file of compiled code, which breaks the programs that follow
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, ({size}, {size}))
 """

@@ -5,6 +5,8 @@ of it. It wants scikit-fem, pypardiso, and for solids of tetrahedra tetgen and m
 mesh ends on the face of the region, where its nodes are fixed: the same support as a body's exact region. Hexahedra are
 of level 1, two to four across a section; tetrahedra as fine as `TETRAHEDRA` says. A further level raises the works of
 the helix by 0.7, 0.7 and 1.3 %, of the spiral by 0.2, 0.1 and 1.4 %, of Y and fork by 0.1 to 0.4 %.
+
+Builds each solid with its region: bodies to compare.
 """
 
 from __future__ import annotations
