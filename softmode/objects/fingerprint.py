@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from softmode.errors import AssetError
-from softmode.files import damage_errors, open_file, read_json
+from softmode.files import damage_errors, open_file, read_file, read_json
 from softmode.foreign.child.layers import inside
 
 _INDEX = (".json", ".gltf")
@@ -52,8 +52,7 @@ def _fingerprint(file: Path, changed: int, size: int) -> str:
             if name and not inside(str(beside), str(file.parent)):
                 raise AssetError(f"object file {file}: {name} leads outside of its folder", hint="copy it there")
             if name and beside.is_file():
-                with open_file(beside, "object file") as stream:
-                    digest.update(stream.read())
+                digest.update(read_file(beside, "object file"))
     return digest.hexdigest()
 
 

@@ -21,6 +21,7 @@ from softmode.checks import require_number
 from softmode.deformables.coupling.rigid_solver import mujoco_warnings
 from softmode.errors import AssetError, ConfigError
 from softmode.foreign import process
+from softmode.foreign.child.model import check_parts, open_spec
 from softmode.foreign.tokens import SUFFIXES
 from softmode.robots.assets import RobotAsset, find, names_file
 from softmode.robots.compiled import CompiledRobot
@@ -184,7 +185,7 @@ def _read(asset: RobotAsset) -> tuple[Any, list[str]]:
     """Return the editable MuJoCo specification of a file whose references have been checked, and notes."""
     if asset.path.suffix.lower() in SUFFIXES:
         spec, notes = read_stage(asset)
-        importlib.import_module("softmode.foreign.child.model").check_parts(spec)
+        check_parts(spec)
         return spec, notes
     tree, notes, text = read_xml(asset.path), [], None
     if tree.tag == "robot":
@@ -198,7 +199,7 @@ def _read(asset: RobotAsset) -> tuple[Any, list[str]]:
     if not asset.trusted:
         process.read("model", asset.path, name=f"robot file {asset.path}", text=text, size=size)
     try:
-        return importlib.import_module("softmode.foreign.child.model").open_spec(str(asset.path), text), notes
+        return open_spec(str(asset.path), text), notes
     except (ValueError, RuntimeError) as error:
         raise AssetError(f"robot file {asset.path}: {_one_line(error)}", hint="mend the file at that line") from error
 

@@ -78,6 +78,15 @@ def inner_points(region: Region, rng: np.random.Generator) -> np.ndarray:
     return np.concatenate([x[distance <= 0.0], (x - np.maximum(distance, 0.0)[:, None] * normal)[:50]])
 
 
+def affine_motion(body: ReducedBody, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return a random affine motion of each region, (R, 3, 3) and (R, 3), and coordinates with it, random elsewhere."""
+    count = len(body.regions)
+    matrix, shift = rng.normal(size=(count, 3, 3)), rng.normal(size=(count, 3))
+    q = rng.normal(size=(body.function_count, 3))
+    q[: body.driven_count] = body.driven_affine(matrix, shift)
+    return matrix, shift, q
+
+
 def test_bodies_of_files_before_keep_their_functions() -> None:
     """A body of version 3, whose envelope was as wide as the body, has the functions that it was built with."""
     body, beside = ReducedBody.load_with(Path(__file__).with_name("held_version_3.npz"))
@@ -184,15 +193,12 @@ def test_gradients_match_finite_differences(body: ReducedBody) -> None:
 def test_regions_are_exact_beyond_the_kernels_reach(body: ReducedBody) -> None:
     """Points of a region that no kernel reaches, of 200 seeds: others vanish, the region moves as it is told."""
     rng = np.random.default_rng(6)
-    count = len(body.regions)
-    matrix, shift = rng.normal(size=(count, 3, 3)), rng.normal(size=(count, 3))
-    q = rng.normal(size=(body.function_count, 3))
-    q[: body.driven_count] = body.driven_affine(matrix, shift)
+    matrix, shift, q = affine_motion(body, rng)
     for i, region in enumerate(body.regions):
         if region.stiffness is None:
             every = np.concatenate([inner_points(region, np.random.default_rng(seed)) for seed in range(200)])
             x = every[~body.covers(every)]
-            assert len(x) or count > 1
+            assert len(x) or len(body.regions) > 1
             value, gradient = body.evaluate(x)
             assert np.abs(value[:, body.driven_count :]).max(initial=0.0) < 1e-12
             terms = np.abs(value) @ np.abs(q)
@@ -216,22 +222,19 @@ def test_only_driven_functions_live_on_exact_regions(body: ReducedBody) -> None:
 def test_regions_follow_affine_motions_exactly(body: ReducedBody) -> None:
     """With q[:r] = driven_affine(A, t) every exact region moves to A_i X + t_i, whatever the free coordinates are."""
     rng = np.random.default_rng(4)
-    count = len(body.regions)
-    matrix, shift = rng.normal(size=(count, 3, 3)), rng.normal(size=(count, 3))
-    q = rng.normal(size=(body.function_count, 3))
-    q[: body.driven_count] = body.driven_affine(matrix, shift)
+    matrix, shift, q = affine_motion(body, rng)
     for i, region in enumerate(body.regions):
         if region.stiffness is None:
             x = inner_points(region, rng)
             assert np.abs(x + body.evaluate(x)[0] @ q - (x @ matrix[i].T + shift[i])).max() < 1e-9
     target = np.zeros_like(body.region_points)
-    for i in range(count):
+    for i in range(len(body.regions)):
         rows = body.region_rows(body.region_names[i])
         target[rows] = body.region_points[rows] @ (matrix[i] - np.eye(3)).T + shift[i]
     np.testing.assert_allclose(body.driven_coordinates(target), q[: body.driven_count], atol=1e-10)
     # A motion of the whole body moves its regions alike.
     one = body.affine(matrix[0], shift[0])[: body.driven_count]
-    exact = body.driven_affine(np.tile(matrix[0], (count, 1, 1)), np.tile(shift[0], (count, 1)))
+    exact = body.driven_affine(np.tile(matrix[0], (len(body.regions), 1, 1)), np.tile(shift[0], (len(body.regions), 1)))
     np.testing.assert_allclose(one, exact, atol=1e-10)
 
 

@@ -70,9 +70,8 @@ class Region:
         """Its least extent, of points about along their principal axes [m]."""
         span = np.asarray(self.box if self.points is None else self.points)
         if self.points is not None:
-            span = (span - span.mean(axis=0)) @ np.linalg.svd(span - span.mean(axis=0), full_matrices=len(span) < 3)[
-                2
-            ].T
+            span = span - span.mean(axis=0)
+            span = span @ np.linalg.svd(span, full_matrices=len(span) < 3)[2].T
         return float(np.ptp(span, axis=0).min()) + 2.0 * self.radius
 
     @property

@@ -1,9 +1,9 @@
 """The 8-wide vectors that the solver's arrays are made of, and how threads share one system on CUDA.
 
-Every function axis is padded to a multiple of eight and stored in blocks of eight: on CPU a block is one SIMD register,
-on CUDA it is what one thread works on. Write sums of products as separate updates (``a = a + x * y``): the compiler
-fuses each into one instruction, while ``a += x * y + u * v`` leaves multiplications and additions apart (measured on
-the stiffness assembly, one core: 81 instead of 23 Gflop/s).
+Every function axis is padded to a multiple of eight, `LANES`, and stored in blocks of eight: on CPU a block is one SIMD
+register, on CUDA it is what one thread works on. Write sums of products as separate updates (``a = a + x * y``): the
+compiler fuses each into one instruction, while ``a += x * y + u * v`` leaves multiplications and additions apart
+(measured on the stiffness assembly, one core: 81 instead of 23 Gflop/s).
 
 A *team* is the group of threads that works on one system: one thread on CPU, one warp on CUDA, where ``barrier``
 separates the phases of a kernel. A team is the last launch dimension and the block size, so that it fills a block.
@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-LANES = 8
-"""Width of the row vectors; every dimension is padded to a multiple of it."""
+from softmode.lanes import LANES
 
 vec8 = wp.types.vector(length=LANES, dtype=float)
 vec8d = wp.types.vector(length=LANES, dtype=wp.float64)
