@@ -71,6 +71,7 @@ class SoftVectorEnv(gym.vector.VectorEnv):
         processes: Child processes that share the worlds on CPU, each on its own core; 1 keeps them in this process.
         device: Warp device; the default one if None.
         progress: Reports the build of the object.
+        fields: Fields of the configuration, such as ``image_size=64``; they replace those of `config`.
 
     Raises:
         ConfigError: If an option is unknown or out of range, or there is no such device.
@@ -99,6 +100,7 @@ class SoftVectorEnv(gym.vector.VectorEnv):
         processes: int = 1,
         device: wp.DeviceLike = None,
         progress: bool | Progress | None = None,
+        **fields: Any,
     ) -> None:
         """Build the scene, capture the step and make the spaces."""
         self._arguments = {
@@ -116,6 +118,7 @@ class SoftVectorEnv(gym.vector.VectorEnv):
             "output": output,
             "processes": processes,
             "device": device,
+            **fields,
         }
         """What a copy is made from; a callback is not."""
         self.num_envs = checked_count("num_envs", num_envs)
@@ -136,7 +139,7 @@ class SoftVectorEnv(gym.vector.VectorEnv):
             preset=preset,
             robot=robot,
         )
-        config = checked_config(self.task_class.config_class, config, given, self.task_class.any_robot)
+        config = checked_config(self.task_class.config_class, config, given, self.task_class.any_robot, fields)
         if output == "torch":
             try:
                 import torch  # noqa: F401

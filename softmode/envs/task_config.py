@@ -16,6 +16,7 @@ from softmode.splats.camera_randomization import CameraRandomization
 ObservationType = Literal["state", "pixels", "pixels_agent_pos"]
 CameraName = Literal["front", "wrist"]
 ImageOutput = Literal["depth", "segmentation"]
+RewardMode = Literal["dense", "sparse"]
 
 _RANGES: dict[str, dict[str, float]] = {
     "youngs_modulus_range": {"above": 0.0},
@@ -40,8 +41,15 @@ class TaskConfig:
     """Vertical stiffness that the drives of another robot are to have at its tool in the home pose [N/m]; None keeps
     them."""
 
+    reward_modes: ClassVar[tuple[str, ...]] = get_args(RewardMode)
+    """What `reward_mode` may be."""
+    terms_follow_mode: ClassVar[bool] = False
+    """Whether the reward's terms are those of the mode; else "sparse" pays 1 for success in place of their sum."""
+
     scene: TableSceneConfig = field(default_factory=TableSceneConfig)
     """Objects, robot and physics."""
+    reward_mode: str = "dense"
+    """"dense": the sum of the reward's terms; "sparse": 1 where the task counts as solved, 0 elsewhere."""
     objects: ObjectSet | None = None
     """Objects of which every world gets one, or several, in place of `scene.object`; material properties without a
     range are those of the object, the range of another property holds for all."""
@@ -79,6 +87,7 @@ class TaskConfig:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
+        require_choice("reward_mode", self.reward_mode, self.reward_modes)
         if self.objects is not None and not isinstance(self.objects, ObjectSet):
             raise ConfigError(f"objects is a {type(self.objects).__name__}", hint="give an ObjectSet([...])")
         if self.objects is not None and self.scene.objects is not None and self.objects != self.scene.objects:

@@ -14,6 +14,7 @@ from softmode.deformables.materials.material import Material
 from softmode.objects.config import ObjectConfig
 from softmode.objects.object_file import file_kind, read_object, surface_cover
 from softmode.objects.pipeline import body_key, build_standing, dressed
+from softmode.objects.presets import PRESETS
 from softmode.objects.soft_object import SoftObject
 from softmode.objects.source import object_source
 from softmode.radiance.grid import RadianceGrid
@@ -39,9 +40,9 @@ def load(
     """Return a soft object: read or make its splats, build or recall its body.
 
     Args:
-        source: A configuration; a file of splats, of a point cloud, of a mesh, of a radiance field or of a body, or an
-            OpenUSD stage with any of these but a field; a body; splats, a field or a mesh (also of trimesh) in memory;
-            None for the built-in plush.
+        source: A configuration; the name of a preset, such as "mug"; a file of splats, of a point cloud, of a mesh, of
+            a radiance field or of a body, or an OpenUSD stage with any of these but a field; a body; splats, a field or
+            a mesh (also of trimesh) in memory; None for the built-in plush.
         material: What it is made of; None for what its file or preset says. The body is built for its Poisson's ratio,
             unless `BuildOptions` name one.
         progress: Passed to :func:`softmode.deformables.build.build_body.build_body`.
@@ -91,6 +92,8 @@ def object_config(source: Source | str | os.PathLike[str] | None, **options: Any
         return source.changed(**options).located()
     if source is None:
         return ObjectConfig(**options)
+    if str(source) in PRESETS:
+        return ObjectConfig(preset=str(source), **options)
     if isinstance(source, str | os.PathLike):
         kind = file_kind(source)
         return ObjectConfig(**{"splat" if kind == "points" else kind: Path(source)}, **options)
