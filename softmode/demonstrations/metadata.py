@@ -84,7 +84,7 @@ def member(folder: Path, name: str) -> Path:
     return path
 
 
-@process.typed("table")
+@files.reader("table")
 def read_table(path: Path, columns: list[str] | None = None) -> Any:
     """Return a Parquet file's table, or of its columns those that are named and there.
 
@@ -108,7 +108,7 @@ def _rows(path: Path) -> list[dict[str, Any]]:
     return table.to_pylist()
 
 
-@process.typed("dataset")
+@files.reader("dataset")
 def read_metadata(folder: str | Path) -> Metadata:
     """Return what the dataset in a folder says about itself.
 

@@ -13,6 +13,7 @@ from pathlib import Path, PurePosixPath
 from xml.etree import ElementTree
 
 from softmode.errors import AssetError
+from softmode.files import read_file
 from softmode.foreign.child.layers import inside
 
 _SIZE_LIMIT = 64 * 2**20
@@ -51,17 +52,9 @@ def read_xml(path: Path) -> ElementTree.Element:
 
 def _parse(path: Path, left: int) -> tuple[ElementTree.Element, int]:
     """Return the root element of a file, and how many elements and attributes it may have at most, `left` or fewer."""
-    if not path.is_file():
-        what = "is a folder" if path.is_dir() else "does not exist"
-        raise AssetError(f"robot file {path} {what}", hint="give the path of an MJCF (.xml) or URDF (.urdf) file")
-    if path.stat().st_size > _SIZE_LIMIT:
-        raise AssetError(
-            f"robot file {path} has {path.stat().st_size} bytes", hint=f"at most {_SIZE_LIMIT} bytes are read"
-        )
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise AssetError(f"robot file {path} cannot be read: {error.strerror}", hint="check its permissions") from error
+    data = read_file(
+        path, "robot file", limit=_SIZE_LIMIT, hint="give an MJCF (.xml) or URDF (.urdf) file that can be read"
+    )
     if b"<!DOCTYPE" in data or b"<!ENTITY" in data or b"\0" in data:  # zeros: UTF-16, which may hide the others
         hint = "remove its <!DOCTYPE>; none is needed, and save it as UTF-8"
         raise AssetError(f"robot file {path} declares a document type, or is no UTF-8", hint=hint)
