@@ -6,6 +6,7 @@ links wherever they lead, so every reference is resolved here first and refused 
 
 from __future__ import annotations
 
+import collections
 import functools
 import os
 import re
@@ -15,11 +16,14 @@ from xml.etree import ElementTree
 from softmode.errors import AssetError
 from softmode.files import read_file
 from softmode.foreign.child.layers import inside
+from softmode.foreign.child.model import MAX_PARTS, MAX_SHAPES
 
 _SIZE_LIMIT = 64 * 2**20
 """Largest XML file that is read [bytes]."""
 _MARK_LIMIT = 500_000
 """Most elements and attributes of a robot file and all that it includes: each takes a hundred bytes and more."""
+_MOST = dict.fromkeys(("key", "body", "link"), MAX_PARTS) | dict.fromkeys(("joint", "geom", "site"), MAX_SHAPES)
+"""Most elements of a kind, of which MuJoCo takes seconds for some ten thousands."""
 _DEPTH_LIMIT = 1000
 _REFERENCE_LIMIT = 4096
 """Most references to files."""
@@ -72,6 +76,11 @@ def _parse(path: Path, left: int) -> tuple[ElementTree.Element, int]:
         level, depth = [child for element in level for child in element], depth + 1
         if depth > _DEPTH_LIMIT:
             raise AssetError(f"robot file {path} is nested deeper than {_DEPTH_LIMIT} levels", hint="flatten it")
+    counts = collections.Counter(element.tag for element in tree.iter())
+    for tag, most in _MOST.items():
+        if counts[tag] > most:
+            text = f"robot file {path} has {counts[tag]} <{tag}>, at most {most} are read"
+            raise AssetError(text, hint="give the robot alone, without the scene around it")
     for element in tree.iter():
         for name, value in element.attrib.items():
             if "nan" in value.lower() and _NAN.search(value) and "name" not in name:  # MuJoCo reads it as nothing
