@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -95,7 +96,8 @@ def read_table(path: Path, columns: list[str] | None = None) -> Any:
     with tempfile.TemporaryDirectory() as folder:
         copy = f"{folder}/table.arrow"
         process.read("table", path, name=name, columns=columns, copy=copy)
-        with pa.OSFile(copy) as source:
+        # Windows removes no file that is mapped; elsewhere the table needs no copy of its bytes.
+        with (pa.OSFile if os.name == "nt" else pa.memory_map)(copy) as source:
             return pa.ipc.open_file(source).read_all()
 
 
