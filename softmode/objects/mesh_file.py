@@ -6,12 +6,12 @@ import os
 from pathlib import Path
 
 from softmode.errors import AssetError
-from softmode.files import require_content
+from softmode.files import reader, require_content
 from softmode.foreign import process, tokens
 from softmode.splats.colored_mesh import ColoredMesh
 
 
-@process.typed("mesh file")
+@reader("mesh file")
 def read_mesh(path: str | os.PathLike[str]) -> ColoredMesh:
     """Read a mesh file of any kind that trimesh reads (.obj, .glb, .gltf, .ply, .stl, .off, ...), with its textures.
 

@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from softmode.errors import AssetError
+from softmode.files import damage_errors
 from softmode.foreign import process
 from softmode.objects.soft_object import SoftObject
 from softmode.objects.stage_bundle import body_of
@@ -67,7 +68,7 @@ def read_usd_mesh(path: str | os.PathLike[str]) -> ColoredMesh:
     answer = _ask(path, geometry=True)
     frame = stage_frame(answer.described, name)
     surfaces = []
-    with process.invalid_data(name):
+    with damage_errors(name):
         for prim in answer.described["meshes"]:
             where, parts = f"{name}: {prim['path']}", parts_of(prim, answer.arrays, frame)
             matrix = frame.matrix(prim["matrix"])

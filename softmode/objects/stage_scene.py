@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from softmode.deformables.materials.material import Material
 from softmode.deformables.materials.material_kernels import MaterialModel
 from softmode.errors import AssetError, MaterialError
+from softmode.files import REEXPORT, damage_errors
 from softmode.foreign import process, tokens
 from softmode.objects.stage_geometry import SurfaceMesh, finite_points, mesh_surface, split_transform, tet_surface
 from softmode.splats.formats.usd import UP_AXES, placed, splats_from_prim
@@ -159,36 +160,19 @@ def open_scene(
     skip: Sequence[str] = (),
 ) -> UsdScene:
     """Do what `read_usd_scene` says for some deformables; write the rest to `rest.usdc` in the folder if `copy`."""
-    request = scene_request(path, asset_root, folder, copy=copy)
-    request |= {"only": None if only is None else list(only), "skip": list(skip)}
     name = f"OpenUSD file {path}"
-    return scene_from_answer(process.ask(request, name=name), name)
-
-
-def scene_request(
-    path: str | os.PathLike[str], asset_root: str | os.PathLike[str] | None, folder: str, *, copy: bool
-) -> dict[str, Any]:
-    """Return the request for a scene, see `process.make_request`."""
-    request = process.make_request(
-        "scene", path, os.path.join(folder, "answer"), asset_root=asset_root, limits=process.Limits()
-    )
+    chosen = {"only": None if only is None else list(only), "skip": list(skip)}
     rest = os.path.join(folder, "rest.usdc") if copy else None
-    return request | {"most": MAX_SPLATS, "copy": rest, "strict": True, "only": None, "skip": []}
-
-
-def scene_from_answer(answer: process.Answer, name: str) -> UsdScene:
-    """Return the scene that the process described, in metres with Z up.
-
-    Raises:
-        AssetError: If values contradict each other.
-    """
+    answer = process.read(
+        "scene", path, name=name, asset_root=asset_root, most=MAX_SPLATS, copy=rest, strict=True, **chosen
+    )
     stage = answer.described
     frame = stage_frame(stage, name)
-    with process.invalid_data(name):
+    with damage_errors(name):
         bodies = tuple(_deformable(body, answer.arrays, frame, name) for body in stage["bodies"])
         scenery = [_splats(prim, answer.arrays, frame, np.eye(4), name) for prim in stage["scenery"]]
     return UsdScene(
-        file=name.removeprefix("OpenUSD file "),
+        file=str(path),
         deformables=bodies,
         meters_per_unit=frame.meters,
         kilograms_per_unit=frame.kilograms,
@@ -324,7 +308,7 @@ def parts_of(shape: dict[str, Any], arrays: list[NDArray[Any]], frame: StageFram
     found: dict[str, Any] = {key: arrays[value] for key, value in shape.items() if type(value) is int}
     points = found.get("points", np.zeros((0, 3)))
     if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind != "f":
-        raise AssetError(f"{shape['path']}: points of shape {points.shape}", hint=process.REEXPORT)
+        raise AssetError(f"{shape['path']}: points of shape {points.shape}", hint=REEXPORT)
     found["points"] = frame.points(points)
     if "widths" in found:
         found["widths"] = frame.meters * found["widths"].astype(np.float64)

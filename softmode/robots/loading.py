@@ -20,6 +20,7 @@ import numpy as np
 from softmode.checks import require_number
 from softmode.deformables.coupling.rigid_solver import mujoco_warnings
 from softmode.errors import AssetError, ConfigError
+from softmode.files import reader
 from softmode.foreign import process
 from softmode.foreign.child.model import check_parts, open_spec
 from softmode.foreign.tokens import SUFFIXES
@@ -37,7 +38,7 @@ _LEAST_MASS, _LEAST_INERTIA = 1.0e-4, 1.0e-7
 """What links that move get that have no mass of their own, [kg] and [kg m^2]."""
 
 
-@process.typed("robot file")
+@reader("robot file")
 def load(
     source: str | Path,
     *,

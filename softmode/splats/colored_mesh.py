@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from softmode.errors import AssetError
+from softmode.files import damage_errors
 from softmode.foreign.child.surface import GREY as GREY
 from softmode.foreign.child.surface import gathered
-from softmode.foreign.process import invalid_data
 
 if TYPE_CHECKING:
     import trimesh
@@ -62,7 +62,7 @@ class ColoredMesh:
         Raises:
             AssetError: If there are no triangles, they have no area, a number is not finite, or a part is damaged.
         """
-        with invalid_data(name):
+        with damage_errors(name):
             return cls(**gathered(source), name=name)
 
     @property

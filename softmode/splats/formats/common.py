@@ -10,11 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softmode.errors import AssetError
+from softmode.files import REEXPORT as REEXPORT
 from softmode.files import damage_errors
 from softmode.splats.splats import MAX_SPLATS, SH_DC
-
-REEXPORT = "The file is damaged or incomplete: copy or export it again"
-"""The remedy for a file that contradicts itself."""
 
 FREE_BYTES = 8 * 2**20
 """Bytes that anything may unpack to however small it is: Zstandard and WebP pack what is all the same without limit."""
@@ -35,7 +33,7 @@ def unreadable(path: object, problem: str, hint: str = REEXPORT) -> AssetError:
 
 def typed_errors(name: str) -> AbstractContextManager[None]:
     """Return the context in which whatever reading a splat file raises becomes AssetError."""
-    return damage_errors(f"splat file {name}", hint=REEXPORT)
+    return damage_errors(f"splat file {name}")
 
 
 def check_count(count: int, name: str) -> int:

@@ -59,10 +59,8 @@ def read_usd(path: str | os.PathLike[str], *, time_code: float | None = None) ->
 
 def _read_stage(file: Path, time_code: float | None) -> Splats:
     """Open the stage in a process of its own and join what that sends back."""
-    with tempfile.TemporaryDirectory() as folder:
-        request = process.make_request("splats", file, f"{folder}/answer", asset_root=None, limits=_LIMITS)
-        request |= {"time": None if time_code is None else float(time_code), "most": MAX_SPLATS}
-        answer = process.ask(request, name=f"splat file {file}")
+    time = None if time_code is None else float(time_code)
+    answer = process.read("splats", file, name=f"splat file {file}", limits=_LIMITS, time=time, most=MAX_SPLATS)
     stage = answer.described
     if not stage["prims"]:
         raise unreadable(
