@@ -378,8 +378,7 @@ class _ElasticSpace:
         return modes, np.concatenate([value, ritz[self.rigid :]])
 
     def _responses(self, held: Held, poissons_ratio: float) -> tuple[Array, Array]:
-        """Return static responses to unit body forces (3 V, 3), and those of second order, to slow loads, and to motions
-        of regions."""
+        """Return static responses to unit body forces (3 V, 3); those of second order, slow loads and moved regions."""
         try:
             factor = linalg.cho_factor(self._stiffness(poissons_ratio), check_finite=False)
         except linalg.LinAlgError as error:
