@@ -67,8 +67,12 @@ class CompiledRobot:
         self.dropped: set[str] = set()
         self.notes: list[str] = []
         """What was chosen where the file does not say."""
-        self.ties = self._ties()
-        """Per joint its leader, and ratio and offset of q_joint = offset + ratio q_leader."""
+        said = [tie for e in range(model.neq) if (tie := self._tie(e)) is not None]
+        self.bound = self._joined(list(dict.fromkeys(said)))
+        """Per joint its leader by the file's ties, and ratio and offset of q_joint = offset + ratio q_leader."""
+        self.ties = self._joined(self._pulled(), self.bound)
+        """The same with the joints of a tendon that one servo pulls, which nothing else ties."""
+        self._bind_ranges()
         self.passive: list[int] = []
         """Joints without a drive, known after `drives`."""
 
@@ -100,12 +104,22 @@ class CompiledRobot:
         """Return the home pose within the joint limits."""
         if given is None:
             values = np.array([self.at_home.get(name, 0.0) for name in self.joint_names]) - self.reference
-            return np.clip(values, self.lower, self.upper)
+            return np.clip(self._followed(np.clip(values, self.lower, self.upper)), self.lower, self.upper)
         values = np.asarray(given, float)
         if values.shape != (len(self.joint_names),) or not np.all(np.isfinite(values)):
             hint = f"give one number for each of {', '.join(self.joint_names)}"
             raise ConfigError(f"home has shape {values.shape} or holds a value that is not finite", hint=hint)
-        return values
+        followed = self._followed(values)
+        for j in np.flatnonzero(np.abs(followed - values) > 1.0e-6):
+            leader = self.joint_names[self.bound[0][j]]
+            self.notes.append(f"home: {self.joint_names[j]!r} follows {leader!r}, so it is {followed[j]:.4g}")
+        return followed
+
+    def _followed(self, joint_q: np.ndarray) -> np.ndarray:
+        """Return coordinates whose followers are where the file's ties have them."""
+        owner, ratio, shift = self.bound
+        moved = np.array(shift) + np.array(ratio) * joint_q[owner]
+        return np.where(np.array(owner) == np.arange(len(owner)), joint_q, moved)
 
     def data(self, joint_q: np.ndarray) -> Any:
         """Return the kinematics at a pose."""
@@ -208,22 +222,53 @@ class CompiledRobot:
         offset, ratio = model.eq_data[e, :2]
         return int(model.eq_obj1id[e]), int(model.eq_obj2id[e]), float(offset), float(ratio)
 
-    def _ties(self) -> tuple[list[int], list[float], list[float]]:
-        """Return per joint its leader, and ratio and offset of q_joint = offset + ratio q_leader."""
-        count = self.model.njnt
-        owner, ratio, shift = list(range(count)), [1.0] * count, [0.0] * count
+    def _pulled(self) -> list[tuple[int, int, float, float]]:
+        """Return ties for servos on tendons: each moves its joints alike, each by the sign of its coefficient."""
         ties: list[tuple[int, int, float, float]] = []
-        for e in range(self.model.neq):
-            tie = self._tie(e)
-            if tie is not None:
-                ties.append(tie)
-        # A servo on a tendon over joints that nothing ties moves them alike, each by the sign of its coefficient.
         for a in range(self.model.nu):
             first, *others = [(j, c) for j, c in self._transmission(a).items() if c] or [(0, 1.0)]
             ties += [(j, first[0], 0.0, math.copysign(1.0, c * first[1])) for j, c in others]
+        return ties
+
+    def _bind_ranges(self) -> None:
+        """Give tied joints the range that all of them can reach together."""
+        owner, ratio, shift = (np.array(part) for part in self.bound)
+        for leader in np.flatnonzero(np.bincount(owner) > 1):
+            group = owner == leader
+            ends = np.sort((np.array([self.lower, self.upper]) - shift)[:, group] / ratio[group], axis=0)
+            low, high = ends[0].max(), ends[1].min()
+            if low >= high:
+                names = ", ".join(repr(self.joint_names[j]) for j in np.flatnonzero(group))
+                raise AssetError(
+                    f"robot file {self.asset.path}: {names} are tied, and their ranges have no pose in common",
+                    hint="widen their limits, or mend ratio and offset of the tie",
+                )
+            reached = np.sort(shift[group] + np.outer([low, high], ratio[group]), axis=0)
+            self.lower[group], self.upper[group] = reached
+
+    def _joined(
+        self,
+        ties: list[tuple[int, int, float, float]],
+        before: tuple[list[int], list[float], list[float]] | None = None,
+    ) -> tuple[list[int], list[float], list[float]]:
+        """Return per joint its leader, and ratio and offset of q_joint = offset + ratio q_leader.
+
+        Args:
+            ties: Joint, leader, offset and ratio.
+            before: Ties that hold already; others that they imply or contradict are left out. Without them, ties in a
+                circle are refused.
+        """
+        count = self.model.njnt
+        owner, ratio, shift = map(list, before or (range(count), [1.0] * count, [0.0] * count))
         for joint, leader, offset, slope in ties:
-            if owner[joint] == owner[leader]:
+            if owner[joint] == owner[leader] and before is not None:
                 continue
+            if owner[joint] == owner[leader]:
+                names = f"{self.joint_names[joint]!r} and {self.joint_names[leader]!r}"
+                raise AssetError(
+                    f"robot file {self.asset.path}: {names} follow each other in a circle",
+                    hint="take one of their ties (<mimic>, <equality>) out of the file",
+                )
             # q_joint = offset + slope q_leader, in terms of the leader's own leader; then all that followed the joint.
             top, slope, offset = owner[leader], slope * ratio[leader], offset + slope * shift[leader]
             old, old_ratio, old_shift = owner[joint], ratio[joint], shift[joint]
@@ -293,5 +338,13 @@ class CompiledRobot:
             )
         if not given:
             return None, link
+        owner, ratio, shift = self.bound
+        given = {name: (float(pair[0]), float(pair[1])) for name, pair in given.items()}
+        for name, pair in list(given.items()):
+            i = self.joint_names.index(name)
+            for j in range(len(owner)):
+                if owner[j] == owner[i] and self.joint_names[j] not in given and drives[j] is not None:
+                    ends = [shift[j] + ratio[j] * (q - shift[i]) / ratio[i] for q in pair]
+                    given[self.joint_names[j]] = (ends[0], ends[1])
         closed, wide = ([float(pair[k]) for pair in given.values()] for k in (0, 1))
         return RobotGripper(joints=tuple(given), closed=tuple(closed), open=tuple(wide)), palm

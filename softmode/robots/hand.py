@@ -44,13 +44,13 @@ class Compiled(Protocol):
 
 
 _NAMES = (
-    "pinch pinch_site grasp_site gripperframe link_tcp tcp tool tool0 end_effector ee gripper attachment_site hand "
-    "Fixed_Jaw"
+    "pinch pinch_site grasp_site grasp gripperframe link_tcp tcp tool tool0 ee_site end_effector ee gripper "
+    "attachment_site hand Fixed_Jaw"
 ).split()
 """Names of sites, then of bodies, that are taken for the tool as they are; the first one present."""
 _PATTERNS = (
-    "*tcp *_tool0 *tool_frame *pinch* *grasp_site *grasp_frame *grip_site *gripper_frame* *gripperframe* "
-    "*tool_center* *end_effector* *endeffector* *_eef *_ee *ee_link *eef_link *ee_frame *attachment* *_hand "
+    "*tcp *tcp_site *_tool0 *tool_frame *pinch* *grasp_site *grasp_frame *grip_site *gripper_frame* *gripperframe* "
+    "grasp* *tool_center* *ee_site *end_effector* *endeffector* *_eef *_ee *ee_link *eef_link *ee_frame *attachment* *_hand "
     "*hand_link *palm *palm_link *gripper_base* *gripper_link *gripper *tool_link *tool *flange"
 ).split()
 """Patterns of the last part of such a name, in small letters, tried after the names."""
@@ -122,8 +122,8 @@ def closing_ends(
 ) -> dict[int, tuple[float, float]]:
     """Return (closed, open) of those joints that move a finger towards the other finger, or towards the palm.
 
-    A joint closes if the mean distance of the nearest points of both sides differs between its ends. Joints that are
-    tied move together, and loops are closed.
+    Joints close if the mean distance of the nearest points of both sides differs between their ends. Those that are
+    tied move, and close, together; loops are closed.
     """
     model = robot.model
     owner, ratio, shift = robot.ties
@@ -137,6 +137,7 @@ def closing_ends(
         if drive is None:
             continue
         group = [i for i in range(model.njnt) if owner[i] == owner[j]]
+        first = next(i for i in joints if owner[i] == owner[j])
         own = fingers[_branch(model, palm, j)]
         others = [b for side in fingers.values() for b in side if b not in own]
         # Two fingers close on each other, one on the palm's own jaw, several on the palm.
@@ -147,13 +148,17 @@ def closing_ends(
             joint_q = start.copy()
             joint_q[group] = [shift[i] + ratio[i] * leader for i in group]
             gaps.append(_mean_gap(robot, joint_q, (own, towards)))
-        if abs(gaps[0] - gaps[1]) >= _LEAST_WAY:
-            low, high = float(drive.lower), float(drive.upper)
-            ends[j] = (low, high) if gaps[0] < gaps[1] else (high, low)
-            way[j] = abs(gaps[0] - gaps[1])
+        way[first] = way.get(first, 0.0) + (gaps[1] - gaps[0]) * np.sign(ratio[j])
+        ends[j] = (float(drive.lower), float(drive.upper))
     # The fingers of a hand also spread: that changes the distance a little.
-    least = _SPREAD * max(way.values(), default=0.0) if len(fingers) > 2 else 0.0
-    return {j: pair for j, pair in ends.items() if way[j] >= least}
+    most = max(map(abs, way.values()), default=0.0)
+    least = max(_LEAST_WAY, _SPREAD * most if len(fingers) > 2 else 0.0)
+    found = {}
+    for j, (low, high) in ends.items():
+        opens = way[next(i for i in joints if owner[i] == owner[j])] * np.sign(ratio[j])
+        if abs(opens) >= least:
+            found[j] = (low, high) if opens > 0.0 else (high, low)
+    return found
 
 
 @mujoco_warnings()
@@ -208,9 +213,15 @@ def surface_corners(model: Any, data: Any, links: Sequence[int]) -> Array:
 
 
 def colliding(model: Any, links: Sequence[int]) -> list[int]:
-    """Return the shapes of links that collide; all of them if none does."""
+    """Return the shapes of links that touch: those that collide, or all of links of which none does.
+
+    Links without a joint between them are one: what is only seen of one does not touch if another collides.
+    """
     own = [geom for geom in range(model.ngeom) if int(model.geom_bodyid[geom]) in links]
-    return [geom for geom in own if model.geom_contype[geom] | model.geom_conaffinity[geom]] or own
+    mask = model.geom_contype | model.geom_conaffinity
+    rigid = model.body_weldid[model.geom_bodyid]
+    solid = {int(rigid[geom]) for geom in own if mask[geom]}
+    return [geom for geom in own if mask[geom] or int(rigid[geom]) not in solid]
 
 
 def _last_part(name: str) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -96,7 +95,7 @@ def gap_of(robot: RobotDescription, jaw: ParallelJaw, opening: float) -> float:
         jaw: Its fingers.
         opening: 0 is closed, 1 is open.
     """
-    model: Any = importlib.import_module("mujoco").MjModel.from_xml_string(robot.mjcf)
+    model = robot.model
     data = _kinematics(robot, model, opening)
     mount = data.xmat[model.body(robot.end_effector).id].reshape(3, 3)
     turn = mount @ (Rotation.from_quat(robot.tool[3:]) * Rotation.from_quat(jaw.frame[3:])).as_matrix()
@@ -112,14 +111,14 @@ def dry_friction_of(robot: RobotDescription) -> float:
     Args:
         robot: A robot with a gripper.
     """
-    model: Any = importlib.import_module("mujoco").MjModel.from_xml_string(robot.mjcf)
+    model = robot.model
     closed, wide = (_kinematics(robot, model, opening).qpos for opening in (0.0, 1.0))
     return float(np.abs(wide - closed) @ model.dof_frictionloss)
 
 
 def _measured(robot: RobotDescription) -> ParallelJaw:
     """Measure the jaw of a robot from a file."""
-    model: Any = importlib.import_module("mujoco").MjModel.from_xml_string(robot.mjcf)
+    model = robot.model
     sides = _fingers(robot, model)
     hand = [model.body(name).id for name in robot.hand_links]
     hand = [link for link in hand if link not in sides[0] + sides[1]]
@@ -215,7 +214,7 @@ def finger_names(robot: RobotDescription) -> tuple[tuple[str, ...], tuple[str, .
     Raises:
         ConfigError: If the robot has no two driven fingers.
     """
-    model: Any = importlib.import_module("mujoco").MjModel.from_xml_string(robot.mjcf)
+    model = robot.model
     first, second = _fingers(robot, model)
     return tuple(model.body(b).name for b in first), tuple(model.body(b).name for b in second)
 

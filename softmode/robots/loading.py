@@ -25,8 +25,8 @@ from softmode.foreign.child.model import check_parts, open_spec
 from softmode.foreign.tokens import SUFFIXES
 from softmode.robots.assets import RobotAsset, find, names_file
 from softmode.robots.compiled import CompiledRobot
-from softmode.robots.description import RobotDescription
-from softmode.robots.hand import find_end_effector
+from softmode.robots.description import JointTie, RobotDescription
+from softmode.robots.hand import colliding, find_end_effector
 from softmode.robots.joint_split import hold_base, split_links
 from softmode.robots.meshes import use_meshes
 from softmode.robots.references import check_references, default_root, read_xml
@@ -120,6 +120,7 @@ def load(
     link, tool = robot.tool(end_effector, np.array(offset), drives)
     jaws, palm = robot.gripper(gripper, drives, start, link)
     behind = sorted({*robot.behind(palm), *robot.behind(link)})
+    robot.notes += _let_touch(spec, robot, behind)
     for equality in list(spec.equalities):
         if equality.name in robot.dropped:
             spec.delete(equality)
@@ -141,8 +142,26 @@ def load(
         tool=tool,
         hand_links=tuple(robot.link(b) for b in behind),
         gripper=jaws,
+        ties=tuple(
+            JointTie(joint=robot.joint_names[j], leader=robot.joint_names[owner], ratio=ratio, offset=offset)
+            for j, (owner, ratio, offset) in enumerate(zip(*robot.bound, strict=True))
+            if owner != j
+        ),
         notes=tuple(robot.notes),
     )
+
+
+def _let_touch(spec: Any, robot: CompiledRobot, hand: list[int]) -> list[str]:
+    """Let what is only seen of a hand collide where nothing else does; return notes."""
+    model, notes = robot.model, []
+    taken = [geom for geom in colliding(model, hand) if not model.geom_contype[geom] | model.geom_conaffinity[geom]]
+    for link in sorted({int(model.geom_bodyid[geom]) for geom in taken}):
+        for geom in spec.body(robot.link(link)).geoms:
+            geom.contype = geom.conaffinity = 1
+        notes.append(f"link {robot.link(link)!r} of the hand has no collision geometry: what is seen of it touches")
+    solid = set(model.geom_bodyid[colliding(model, hand)].tolist())
+    bare = [repr(robot.link(b)) for b in hand if b not in solid]
+    return notes + ([f"links of the hand that touch nothing: {', '.join(bare)}"] if bare else [])
 
 
 def _attach(spec: Any, asset: RobotAsset, flange: str | None, hand: RobotAsset) -> tuple[str, list[str]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -389,7 +388,7 @@ def _about_z(angle: Array) -> Rotation:
 
 def _closed_loops(robot: RobotDescription, joint_q: Array) -> Array:
     """Return joint coordinates with the loops closed by the passive joints, within the limits."""
-    model = importlib.import_module("mujoco").MjModel.from_xml_string(robot.mjcf)
+    model = robot.model
     passive = [robot.joint_names.index(name) for name in robot.passive_joints]
     data = settled(model, model.qpos0 + joint_q, passive)
     return np.clip(np.asarray(data.qpos) - model.qpos0, robot.joint_lower, robot.joint_upper)
