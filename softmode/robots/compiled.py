@@ -167,9 +167,15 @@ class CompiledRobot:
         driven = [j for j in range(count) if self.joint_names[j] not in self.undriven]
         torque_limit: dict[int, float] = {} if model.nu else dict.fromkeys(driven, math.inf)
         for a in range(model.nu):
-            arms = self._transmission(a)
+            arms, name = self._transmission(a), f"actuator {model.actuator(a).name or a!r}"
             if not arms or len({owner[j] for j in arms}) != 1:
+                kind = self.mujoco.mjtTrn(int(model.actuator_trntype[a])).name.removeprefix("mjTRN_").lower()
+                what = "adhesion, which" if kind == "body" else f"a {kind} actuator that" if not arms else "one that"
+                self.notes.append(f"{name} is left out: {what} drives no joint and no group of tied joints")
                 continue
+            dynamics = self.mujoco.mjtDyn(int(model.actuator_dyntype[a])).name.removeprefix("mjDYN_").lower()
+            if dynamics != "none":
+                self.notes.append(f"{name}: its activation ({dynamics}) is left out, it acts at once")
             leader = owner[next(iter(arms))]
             limit = float(np.min(np.abs(model.actuator_forcerange[a]))) if model.actuator_forcelimited[a] else math.inf
             # The force on the leader's coordinate, each joint's part bounded by its own limit.
@@ -184,6 +190,7 @@ class CompiledRobot:
                 continue
             lever = sum(c * ratio[j] for j, c in arms.items())
             if lever == 0.0:
+                self.notes.append(f"{name} is left out: the joints that it pulls cancel")
                 continue
             zero = sum(c * (shift[j] + self.reference[j]) for j, c in arms.items())
             ends = [-math.inf, math.inf]
@@ -207,10 +214,17 @@ class CompiledRobot:
             if drive is None and owner[j] in torque_limit:
                 drives[j] = self._default_drive(j, min(torque_limit[owner[j]], self._joint_limit(j)))
         self.passive = [j for j in range(count) if drives[j] is None]
+        for name, drive in zip(self.joint_names, drives, strict=True):
+            if drive is not None and drive.effort_limit == 0.0:
+                self.notes.append(f"the drive of joint {name!r} has force limit 0: it does not move it")
         # A tie between driven joints is what their drives replace; one between passive joints stays.
+        loops = (int(self.mujoco.mjtEq.mjEQ_CONNECT), int(self.mujoco.mjtEq.mjEQ_WELD))
         for e in range(model.neq):
-            if self._tie(e) is not None and drives[int(model.eq_obj1id[e])] is not None:
-                self.dropped.add(model.equality(e).name)
+            name, tie = model.equality(e).name, self._tie(e)
+            if tie is None and int(model.eq_type[e]) not in loops:
+                self.notes.append(f"equality {name!r} is left out: it ties no two joints in proportion, or is not active")
+            if (drives[tie[0]] is not None) if tie else int(model.eq_type[e]) not in loops:
+                self.dropped.add(name)
         return tuple(drives)
 
     def _tie(self, e: int) -> tuple[int, int, float, float] | None:
@@ -298,10 +312,19 @@ class CompiledRobot:
 
     @functools.cached_property
     def _inertias(self) -> np.ndarray:
-        """What each joint accelerates in the home pose, the others held [kg or kg m^2], shape (joint_count,)."""
-        mass = np.zeros((self.model.nv, self.model.nv))
-        self.mujoco.mj_fullM(self.model, self.data(self.home(None)), mass)
-        return np.diag(mass)
+        """What each joint accelerates, the others held [kg or kg m^2], shape (joint_count,).
+
+        In the home pose; where that is zero, also in a bent one: the larger number of both.
+        """
+        poses = [self.home(None)]
+        if not np.any(poses[0]):  # a straight arm: what its axes carry stands off them once it bends
+            low, high = np.maximum(self.lower, -math.pi), np.minimum(self.upper, math.pi)
+            hinge = self.model.jnt_type == int(self.mujoco.mjtJoint.mjJNT_HINGE)
+            poses.append(np.where(hinge, np.clip(0.25 * math.pi, 0.75 * low + 0.25 * high, high), 0.0))
+        masses = np.zeros((len(poses), self.model.nv, self.model.nv))
+        for mass, pose in zip(masses, poses, strict=True):
+            self.mujoco.mj_fullM(self.model, self.data(self._followed(pose)), mass)
+        return masses.diagonal(axis1=1, axis2=2).max(axis=0)
 
     def _default_drive(self, j: int, limit: float) -> JointDrive:
         """Return a critically damped drive for a joint without servo."""

@@ -188,7 +188,7 @@ def _pad_corners(model: Any, data: Any, side: list[int], out: Array) -> Array:
     return np.concatenate(near) if near else np.empty((0, 3))
 
 
-_HINT = "give ParallelJaw(opening=..., ...) yourself"
+_HINT = "give ParallelJaw(opening=..., ...) yourself; tasks need two fingers that both move"
 
 
 def _fingers(robot: RobotDescription, model: Any) -> tuple[list[int], list[int]]:
@@ -196,16 +196,28 @@ def _fingers(robot: RobotDescription, model: Any) -> tuple[list[int], list[int]]
     joints = robot.gripper.joints if robot.gripper else ()
     driven = {model.body(robot.joint_links[robot.joint_names.index(name)]).id for name in joints}
     roots = [link for link in sorted(driven) if not _above(model, link) & driven]
-    if len(roots) != 2:
-        raise ConfigError(f"robot {robot.name!r} has {len(roots)} driven fingers, not two", hint=_HINT)
-    sides = []
+    sides: list[set[int]] = []
     for root in roots:
         palm = int(model.body_parentid[root])
-        own = [b for b in range(1, model.nbody) if root in {b, *_above(model, b)}]
+        own = {b for b in range(1, model.nbody) if root in {b, *_above(model, b)}}
         # A link that a loop ties to the driven one belongs to the finger: the pads of linkages hang there.
-        sides.append(sorted({*own, *side_of(model, palm, root)}))
-    first, second = sides
+        sides.append(own | set(side_of(model, palm, root)))
+    leaders = {tie.joint: tie.leader for tie in robot.ties}
+    if len(sides) > 2 and len({leaders.get(name, name) for name in joints}) == 1:
+        sides = _two_sides(robot, model, sides)
+    if len(sides) != 2:
+        raise ConfigError(f"robot {robot.name!r} has {len(roots)} driven fingers, not two", hint=_HINT)
+    first, second = (sorted(side) for side in sides)
     return first, second
+
+
+def _two_sides(robot: RobotDescription, model: Any, sides: list[set[int]]) -> list[set[int]]:
+    """Return two fingers of branches of the palm that one motor moves, by the direction in which they close."""
+    closed, wide = (_kinematics(robot, model, opening) for opening in (0.0, 1.0))
+    moved = np.array([(wide.xipos - closed.xipos)[sorted(side)].mean(0) for side in sides])
+    along = moved @ moved[np.linalg.norm(moved, axis=1).argmax()] > 0.0
+    groups = [set().union(*(side for side, one in zip(sides, along, strict=True) if one == k)) for k in (True, False)]
+    return [group for group in groups if group]
 
 
 def finger_names(robot: RobotDescription) -> tuple[tuple[str, ...], tuple[str, ...]]:

@@ -72,8 +72,9 @@ def load(
         hand: A gripper that the robot's file has not: a name, or a file that holds nothing else. Its first link is put
             upon `end_effector`, the flange; its own end effector becomes that of the robot, and its names begin with
             ``hand_``.
-        asset_root: Folder outside which the file may refer to nothing. If omitted: its own folder, or the one above a
-            folder called `urdf` or `robots`, and of a URDF the packages that it names, found above it.
+        asset_root: Folder outside which the file may refer to nothing. If omitted: its own folder, the one above a
+            folder called `urdf`, `mjcf` or the like, or that of its `package.xml`; and of a URDF the packages that it
+            names, found above it.
         drive_bandwidth: Natural frequency of the drives of joints without a servo [Hz].
         floating: Whether a base on a free joint may move, by three slides and three hinges without drives;
             otherwise it is held where the home pose has it.
@@ -101,7 +102,7 @@ def load(
     free = [j for j in range(full.njnt) if full.jnt_type[j] == 0 and full.body_parentid[full.jnt_bodyid[j]] == 0]
     at_home = {full.joint(j).name: float(key[full.jnt_qposadr[j]]) for j in range(full.njnt)}
     root = asset.root if root is None else root
-    _keep_robot(spec, root, asset)
+    notes += _keep_robot(spec, root, asset)
     if hand is not None:
         end_effector, more = _attach(spec, asset, end_effector, _locate(hand, None, download))
         notes += more
@@ -160,7 +161,7 @@ def _let_touch(spec: Any, robot: CompiledRobot, hand: list[int]) -> list[str]:
             geom.contype = geom.conaffinity = 1
         notes.append(f"link {robot.link(link)!r} of the hand has no collision geometry: what is seen of it touches")
     solid = set(model.geom_bodyid[colliding(model, hand)].tolist())
-    bare = [repr(robot.link(b)) for b in hand if b not in solid]
+    bare = [repr(robot.link(b)) for b in hand if b not in solid and model.body_geomnum[b]]
     return notes + ([f"links of the hand that touch nothing: {', '.join(bare)}"] if bare else [])
 
 
@@ -168,7 +169,7 @@ def _attach(spec: Any, asset: RobotAsset, flange: str | None, hand: RobotAsset) 
     """Put a gripper upon a robot's flange; return the name of the site or link that carries the tool, and notes."""
     tool, notes = _read(hand)
     _compile(tool, hand, notes)
-    _keep_robot(tool, hand.root, hand)
+    notes += _keep_robot(tool, hand.root, hand)
     compiled = CompiledRobot(_compile(tool, hand), hand, {})
     name = hand.end_effector or find_end_effector(compiled, compiled.drives())[0]
     if flange is None:
@@ -192,8 +193,8 @@ def _locate(source: str | Path, asset_root: str | Path | None, download: bool) -
     if isinstance(source, str) and not names_file(source):
         return find(source, download=download)
     path = Path(source)
-    urdf = path.suffix.lower() == ".urdf"
-    folder = Path(asset_root) if asset_root is not None else default_root(path) if urdf else path.parent
+    stage = path.suffix.lower() in SUFFIXES
+    folder = Path(asset_root) if asset_root is not None else path.parent if stage else default_root(path)
     if path.exists() and not path.resolve().is_relative_to(folder.resolve()):
         raise AssetError(f"robot file {path} lies outside asset_root = {folder}", hint="name a folder that holds it")
     return RobotAsset(name=path.stem, path=path, asset_root=folder, root_given=asset_root is not None)
@@ -242,11 +243,36 @@ def _prepare_urdf(tree: ElementTree.Element, asset: RobotAsset) -> tuple[str, li
         inertia = link.find("inertial/inertia")
         if inertia is not None and _mended(inertia):
             notes.append(f"link {link.get('name')!r} had an inertia that is none, only its diagonal is kept")
+    notes += _checked_joints(tree, asset)
     for texture in tree.iter("texture"):
         texture.attrib.pop("filename", None)
     files = {mesh.get("filename", "") for mesh in tree.iter("mesh")}
     size = sum(Path(file).stat().st_size for file in files if Path(file).is_file())
     return ElementTree.tostring(tree, encoding="unicode"), notes, size
+
+
+def _checked_joints(tree: ElementTree.Element, asset: RobotAsset) -> list[str]:
+    """Refuse limits and ties of a URDF that MuJoCo would pass over without a word; return notes."""
+    notes, names = [], {joint.get("name") for joint in tree.findall("joint")}
+    for joint in tree.findall("joint"):
+        name, limit, mimic = joint.get("name"), joint.find("limit"), joint.find("mimic")
+        if mimic is not None and mimic.get("joint") not in names - {name}:
+            raise AssetError(
+                f"robot file {asset.path}: joint {name!r} mimics {mimic.get('joint')!r}, which is no other joint of it",
+                hint=f"name one of {', '.join(sorted(map(str, names - {name})))}, or remove <mimic>",
+            )
+        if limit is None or joint.get("type") not in ("revolute", "prismatic"):
+            continue
+        try:
+            low, high, effort = (float(limit.get(key, d)) for key, d in (("lower", 0), ("upper", 0), ("effort", -1)))
+        except ValueError:
+            continue  # the compiler says where
+        if low > high:
+            text = f"robot file {asset.path}: joint {name!r} has its lower limit {low:g} above the upper one {high:g}"
+            raise AssetError(text, hint="exchange them")
+        notes += [f"joint {name!r} has the empty range {low:g} to {high:g}: taken as no limit"] if low == high else []
+        notes += [f"joint {name!r} has effort 0: taken as no limit"] if effort == 0.0 else []
+    return notes
 
 
 def _mended(inertia: ElementTree.Element) -> bool:
@@ -292,8 +318,8 @@ def _one_line(error: Exception) -> str:
     return "; ".join(line.strip() for line in str(error).splitlines() if line.strip())
 
 
-def _keep_robot(spec: Any, root: str | None, asset: RobotAsset) -> None:
-    """Delete all but the robot, name what has no name, make asset paths absolute."""
+def _keep_robot(spec: Any, root: str | None, asset: RobotAsset) -> list[str]:
+    """Delete all but the robot, name what has no name, make asset paths absolute; return notes."""
     tops = list(spec.worldbody.bodies)
     chosen = [body for body in tops if body.name == root] if root is not None else tops
     if len(chosen) != 1:
@@ -302,6 +328,13 @@ def _keep_robot(spec: Any, root: str | None, asset: RobotAsset) -> None:
         raise ConfigError(
             f"robot file {asset.path} {what}", hint=f"pass root= one of {names}" if tops else "give it a <body>"
         )
+    left = [body.name or "a body without a name" for body in tops if body is not chosen[0]]
+    left += [f"{len(spec.worldbody.geoms)} shapes of the world"] if spec.worldbody.geoms else []
+    notes = [f"left out beside the robot: {', '.join(left)}"] if left else []
+    for body in spec.bodies:
+        if body.mocap:
+            body.mocap = False
+            notes.append(f"link {body.name!r} is moved from outside (mocap) in the file: here it stands still")
     for group in (spec.keys, spec.cameras, spec.lights, spec.sensors, spec.worldbody.geoms, spec.worldbody.sites):
         for element in list(group):
             spec.delete(element)
@@ -309,6 +342,7 @@ def _keep_robot(spec: Any, root: str | None, asset: RobotAsset) -> None:
         if body is not chosen[0]:
             spec.delete(body)
     if root is not None:
+        notes += [f"{root!r} moved from {np.round(chosen[0].pos, 4).tolist()} m to the origin"]
         chosen[0].pos, chosen[0].quat = (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
     for kind, group in (("link", spec.bodies), ("joint", spec.joints), ("equality", spec.equalities)):
         for k, element in enumerate(group):
@@ -327,3 +361,4 @@ def _keep_robot(spec: Any, root: str | None, asset: RobotAsset) -> None:
                 raise AssetError(f"robot file {asset.path} refers to {file}", hint="keep assets inside the asset root")
             element.file = str(file)
     spec.meshdir = spec.texturedir = ""
+    return notes

@@ -29,8 +29,8 @@ _NESTED_TAGS = ("include", "model")
 """Elements whose file is itself a model."""
 _LEVELS = 8
 """How many folders above a robot file its packages are looked for in."""
-_URDF_FOLDERS = ("urdf", "urdfs", "robots")
-"""Names of folders of a package that hold URDF files alone; meshes lie beside them."""
+_MODEL_FOLDERS = ("urdf", "urdfs", "robots", "mjcf", "xml", "xmls", "models")
+"""Names of folders of a package that hold robot files alone; meshes lie beside them."""
 
 
 def read_xml(path: Path) -> ElementTree.Element:
@@ -170,7 +170,7 @@ def resolve_package(whole: str, file: Path, root: Path, given: bool) -> Path:
     """Return the file that a reference `package://NAME/PATH` means.
 
     It is looked for in the asset root, and in the folder of the package: one above the file or beside what lies above
-    it, whose `package.xml` has that name.
+    it, whose `package.xml` has that name, or which has that name and a `package.xml`.
 
     Args:
         whole: What stands behind `package://`.
@@ -197,15 +197,20 @@ def package_folder(name: str, rest: str, file: Path) -> Path | None:
         return None
     for up in list(file.resolve().parents)[:_LEVELS]:
         for folder in (up / name, up):
-            if _package_name(folder) == name and (folder / rest).exists():
+            found = _package_name(folder)
+            if (found == name or (found is not None and folder.name == name)) and (folder / rest).exists():
                 return folder
     return None
 
 
 def default_root(file: Path) -> Path:
-    """Return the folder that a URDF may refer to: its own, or the one above if its own is one for URDF files."""
+    """Return the folder that a robot file may refer to: its own, or its package's.
+
+    That is the one above if its own holds robot files alone, or one further above that has a `package.xml`.
+    """
     folder = file.parent
-    return folder.parent if folder.name in _URDF_FOLDERS else folder
+    package = next((up for up in list(folder.parents)[:_LEVELS] if (up / "package.xml").is_file()), None)
+    return package or (folder.parent if folder.name in _MODEL_FOLDERS else folder)
 
 
 def _package_name(folder: Path) -> str | None:

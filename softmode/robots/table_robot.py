@@ -9,6 +9,7 @@ from typing import Any
 
 import newton
 import numpy as np
+import warp as wp
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -32,6 +33,12 @@ _YAW = 1.4
 """How far the tool must turn about the vertical to either side over the home position [rad]."""
 _NEAR = 2.0e-3
 """Error of the inverse kinematics that counts as reached [m]."""
+_SHARES = (1.0, 0.75, 0.5, 0.3)
+"""Shares of the ranges that are tried in turn."""
+_HEIGHTS = (0.0, 0.15, 0.3, 0.45)
+"""How high above the table the base is tried, in turn [m]."""
+_LOW = 0.13
+"""Lowest tool position of the home pose that a robot of small reach gets [m]: over what stands on the table."""
 _STUCK = 0.5e-3
 """How far dry friction of its joints may hold a finger from where its drive aims [m]."""
 
@@ -144,6 +151,13 @@ class TableRobot:
     ) -> RobotIndices:
         """Add the robot in its home pose to a builder; `xform` places its base elsewhere."""
         newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
+        if self.base[2] > 0.0 and xform is None:  # a pedestal, only to be seen
+            place = wp.transform(wp.vec3(*self.base[:2], 0.5 * self.base[2]), wp.quat_identity())
+            config = newton.ModelBuilder.ShapeConfig(density=0.0, has_shape_collision=False)
+            config.has_particle_collision = False
+            half = (0.08, 0.08, 0.5 * self.base[2])
+            color = (0.30, 0.31, 0.33)
+            builder.add_shape_box(-1, place, *half, cfg=config, color=color, label=f"{label}/pedestal")
         return self.robot.add_to(builder, xform=base_pose(self.base) if xform is None else xform, label=label)
 
 
@@ -185,8 +199,9 @@ def place_robot(
 ) -> TableRobot:
     """Place a loaded robot at the table, so that it reaches what a task needs with the tool pointing down.
 
-    Distance and direction of the base are searched: the most places first, then the middle of what serves.
-    Where not all is in reach, the ranges shrink about their middle; `TableRobot.share` says by how much.
+    Distance, direction and height of the base are searched: the most places first, then the least height, then the
+    middle of what serves. Where not all is in reach, the ranges shrink about their middle, and so do the heights of
+    home pose and places; `TableRobot.share` says by how much.
 
     Args:
         robot: The robot, with a gripper of two fingers.
@@ -221,22 +236,28 @@ def place_robot(
             f"robot {robot.name!r} has {len(chain.joints)} joints between base and tool, expected 5 to {JOINT_MAX}",
             hint="write control.joint_target_q yourself, see RobotDescription.with_opening",
         )
-    box = np.stack(np.meshgrid([-1.0, 1.0], [-1.0, 1.0], [0.02, height], indexing="ij"), axis=-1).reshape(-1, 3)
-    given = None if base is None else [tuple(float(value) for value in base)]
     # The fingers may change sides: half a turn about the tool, which may free the last joint's range.
     half = Rotation.from_quat(jaw.frame[3:]) * Rotation.from_rotvec([0.0, 0.0, np.pi])
     other = (*jaw.frame[:3], *half.as_quat().tolist())
     jaws = [jaw, replace(jaw, frame=other)]
+    bases = [[tuple(map(float, base))]] if base is not None else [_bases(chain, over, up) for up in _HEIGHTS]
     best: tuple[float, ParallelJaw, Any, Array] | None = None
-    for share in (1.0, 0.75, 0.5, 0.3):
-        places = box * [share * ranges[0], share * ranges[1], 1.0] + [*over, 0.0]
-        points = np.concatenate([np.array([home_position] * 3, float), places])
-        yaw = np.array([0.0, _YAW, -_YAW] + [0.0] * len(box))
-        found = [_placed(robot, one, given, over, points, yaw) for one in jaws]
-        found = [one for one in found if one is not None]
-        if found:
-            _, chosen, placed, q = min(found, key=lambda one: one[0])
-            best = share, chosen, placed, q
+    home = np.array(home_position, float)
+    for share in _SHARES:
+        if share < 1.0:
+            home[2] = max(share * home_position[2], min(home_position[2], _LOW))
+        box = np.stack(np.meshgrid([-1.0, 1.0], [-1.0, 1.0], [0.02, max(share * height, home[2])], indexing="ij"), -1)
+        places = box.reshape(-1, 3) * [share * ranges[0], share * ranges[1], 1.0] + [*over, 0.0]
+        points = np.concatenate([np.array([home] * 3), places])
+        yaw = np.array([0.0, _YAW, -_YAW] + [0.0] * len(places))
+        for some in bases:
+            found = [_placed(robot, one, some, points, yaw) for one in jaws]
+            found = [one for one in found if one is not None]
+            if found:
+                _, chosen, placed, q = min(found, key=lambda one: one[0])
+                best = share, chosen, placed, q
+                break
+        if best is not None:
             break
     if best is None:
         raise ConfigError(
@@ -245,6 +266,7 @@ def place_robot(
             hint="use a larger robot, a lower home_position, or name its tool: load(..., end_effector=, tool_offset=)",
         )
     share, jaw, placed, q = best
+    home_position = home.tolist()
     gaps = np.maximum.accumulate([gap_of(robot, jaw, s) for s in np.linspace(0.0, 1.0, _OPENINGS)])
     gaps = np.maximum(gaps, 0.0) + 1.0e-7 * np.arange(_OPENINGS)  # ascending
     jaw = replace(jaw, opening=float(gaps[-1]))
@@ -315,7 +337,7 @@ def _with_grip(
 
 
 def _placed(
-    robot: RobotDescription, jaw: ParallelJaw, given: list[Any] | None, over: Sequence[float], points: Array, yaw: Array
+    robot: RobotDescription, jaw: ParallelJaw, bases: list[Any], points: Array, yaw: Array
 ) -> tuple[float, ParallelJaw, Any, Array] | None:
     """Return how far from home, the jaw, the base, and the coordinates over the first point; None if none reaches all.
 
@@ -323,12 +345,16 @@ def _placed(
     and leaves the last joint room to turn the tool.
     """
     chain = serial_chain(robot, jaw.frame)
-    bases = _bases(chain, over) if given is None else given
-    count = len(points)
-    rows, turns = np.tile(points, (len(bases), 1)), np.tile(yaw, len(bases))
-    q, error = _reach(chain, np.repeat(np.array(bases), count, axis=0), rows, turns, chain.home)
-    reached = (error.reshape(-1, count) <= _NEAR).all(axis=1)
-    at_home = q.reshape(-1, count, q.shape[1])[:, 0]
+    at_home, error = _reach(chain, np.array(bases), np.tile(points[0], (len(bases), 1)), yaw[:1], chain.home)
+    reached = error <= _NEAR
+    for some in (slice(3, None), slice(1, 3)):  # the places are what most bases do not reach
+        left = np.flatnonzero(reached)
+        if not len(left):
+            return None
+        count = len(points[some])
+        rows, turns = np.tile(points[some], (len(left), 1)), np.tile(yaw[some], len(left))
+        _, error = _reach(chain, np.repeat(np.array(bases)[left], count, axis=0), rows, turns, chain.home)
+        reached[left] = (error.reshape(-1, count) <= _NEAR).all(axis=1)
     middles = []
     for turn in dict.fromkeys(one[3] for one in bases):
         chosen = [k for k in np.flatnonzero(reached) if bases[k][3] == turn]
@@ -342,10 +368,10 @@ def _placed(
     return change[k], jaw, bases[k], at_home[k]
 
 
-def _bases(chain: SerialChain, over: Sequence[float]) -> list[Any]:
-    """Return places of the base: on the near side of the table, at several distances, turned by quarter turns."""
+def _bases(chain: SerialChain, over: Sequence[float], up: float) -> list[Any]:
+    """Return places of the base: at a height, at several distances on the near side, turned by quarter turns."""
     return [
-        (float(over[0] - share * chain.reach), float(over[1]), 0.0, turn)
+        (float(over[0] - share * chain.reach), float(over[1]), up, turn)
         for turn in (0.0, 0.5 * math.pi, -0.5 * math.pi, math.pi)
         for share in np.linspace(0.25, 0.95, 15)
     ]
@@ -363,7 +389,7 @@ def _reach(chain: SerialChain, base: Array, points: Array, yaw: Array, start: Ar
         yaw: Rotation of the tool about the vertical there [rad], shape (N,).
         start: The home pose.
     """
-    base = np.broadcast_to(base, (len(points), 4))
+    base, yaw = np.broadcast_to(base, (len(points), 4)), np.broadcast_to(yaw, len(points))
     local = _about_z(-base[:, 3]).apply(points - base[:, :3])
     turns = _about_z(yaw - base[:, 3]).as_matrix() @ _DOWN
     low, high = chain.span
