@@ -14,7 +14,7 @@ from softmode.errors import ConfigError
 from softmode.robots.arm import ArmDescription
 from softmode.robots.arm_shapes import finger_parts, hand_parts
 from softmode.robots.description import RobotDescription, ToolPose
-from softmode.robots.hand import colliding, settled, side_of, surface_corners
+from softmode.robots.hand import colliding, opposed, settled, side_of, surface_corners
 
 Array = NDArray[np.float64]
 
@@ -204,20 +204,14 @@ def _fingers(robot: RobotDescription, model: Any) -> tuple[list[int], list[int]]
         sides.append(own | set(side_of(model, palm, root)))
     leaders = {tie.joint: tie.leader for tie in robot.ties}
     if len(sides) > 2 and len({leaders.get(name, name) for name in joints}) == 1:
-        sides = _two_sides(robot, model, sides)
+        ends = [_kinematics(robot, model, opening) for opening in (0.0, 1.0)]
+        sides = opposed(*ends, sides)
     if len(sides) != 2:
         raise ConfigError(f"robot {robot.name!r} has {len(roots)} driven fingers, not two", hint=_HINT)
     first, second = (sorted(side) for side in sides)
     return first, second
 
 
-def _two_sides(robot: RobotDescription, model: Any, sides: list[set[int]]) -> list[set[int]]:
-    """Return two fingers of branches of the palm that one motor moves, by the direction in which they close."""
-    closed, wide = (_kinematics(robot, model, opening) for opening in (0.0, 1.0))
-    moved = np.array([(wide.xipos - closed.xipos)[sorted(side)].mean(0) for side in sides])
-    along = moved @ moved[np.linalg.norm(moved, axis=1).argmax()] > 0.0
-    groups = [set().union(*(side for side, one in zip(sides, along, strict=True) if one == k)) for k in (True, False)]
-    return [group for group in groups if group]
 
 
 def finger_names(robot: RobotDescription) -> tuple[tuple[str, ...], tuple[str, ...]]:
