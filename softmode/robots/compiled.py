@@ -222,7 +222,9 @@ class CompiledRobot:
         for e in range(model.neq):
             name, tie = model.equality(e).name, self._tie(e)
             if tie is None and int(model.eq_type[e]) not in loops:
-                self.notes.append(f"equality {name!r} is left out: it ties no two joints in proportion, or is not active")
+                self.notes.append(
+                    f"equality {name!r} is left out: it ties no two joints in proportion, or is not active"
+                )
             if (drives[tie[0]] is not None) if tie else int(model.eq_type[e]) not in loops:
                 self.dropped.add(name)
         return tuple(drives)

@@ -50,8 +50,8 @@ _NAMES = (
 """Names of sites, then of bodies, that are taken for the tool as they are; the first one present."""
 _PATTERNS = (
     "*tcp *tcp_site *_tool0 *tool_frame *pinch* *grasp_site *grasp_frame *grip_site *gripper_frame* *gripperframe* "
-    "grasp* *tool_center* *ee_site *end_effector* *endeffector* *_eef *_ee *ee_link *eef_link *ee_frame *attachment* *_hand "
-    "*hand_link *palm *palm_link *gripper_base* *gripper_link *gripper *tool_link *tool *flange"
+    "grasp* *tool_center* *ee_site *end_effector* *endeffector* *_eef *_ee *ee_link *eef_link *ee_frame *attachment* "
+    "*_hand *hand_link *palm *palm_link *gripper_base* *gripper_link *gripper *tool_link *tool *flange"
 ).split()
 """Patterns of the last part of such a name, in small letters, tried after the names."""
 _POINTS = 400

@@ -212,8 +212,6 @@ def _fingers(robot: RobotDescription, model: Any) -> tuple[list[int], list[int]]
     return first, second
 
 
-
-
 def finger_names(robot: RobotDescription) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the names of the links of both fingers.
 

@@ -193,6 +193,7 @@ def place_robot(
     over: Sequence[float] = (0.45, 0.0),
     ranges: Sequence[float] = (0.09, 0.16),
     height: float = 0.24,
+    also: Sequence[Sequence[float]] = (),
     base: Sequence[float] | None = None,
     grip_force: float = 40.0,
     grip_way: float | None = 0.01,
@@ -210,6 +211,7 @@ def place_robot(
         over: Middle of the places on the table [m], shape (2,).
         ranges: Half-widths of the places in x and y [m].
         height: Highest place over the table [m].
+        also: Places that do not move where the ranges shrink [m], shape (N, 3).
         base: Where the base stands, x, y, z [m] and rotation [rad]; searched if omitted.
         grip_force: Largest force of a finger on what it holds [N]; what the file's drive leaves over after the dry
             friction of the finger's joints, if that is less.
@@ -248,8 +250,8 @@ def place_robot(
             home[2] = max(share * home_position[2], min(home_position[2], _LOW))
         box = np.stack(np.meshgrid([-1.0, 1.0], [-1.0, 1.0], [0.02, max(share * height, home[2])], indexing="ij"), -1)
         places = box.reshape(-1, 3) * [share * ranges[0], share * ranges[1], 1.0] + [*over, 0.0]
-        points = np.concatenate([np.array([home] * 3), places])
-        yaw = np.array([0.0, _YAW, -_YAW] + [0.0] * len(places))
+        points = np.concatenate([np.array([home] * 3), places, np.reshape(np.array(also, float), (-1, 3))])
+        yaw = np.array([0.0, _YAW, -_YAW] + [0.0] * (len(points) - 3))
         for some in bases:
             found = [_placed(robot, one, some, points, yaw) for one in jaws]
             found = [one for one in found if one is not None]
