@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import importlib
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -78,6 +79,10 @@ class SerialChain:
         position, rotation, _, _ = self._sweep(q)
         return position, rotation
 
+    def lowest(self, q: Array) -> Array:
+        """Return the height of the lowest joint but the first over the base [m], shape (B,)."""
+        return self._sweep(q)[3][:, 1:, 2].min(axis=1, initial=math.inf)
+
     def jacobian(self, q: Array) -> Array:
         """Return d(position, rotation)/dq in the base frame, shape (B, 6, n)."""
         position, _, axes, anchors = self._sweep(q)
@@ -116,7 +121,7 @@ class SerialChain:
         Args:
             position: Wanted positions [m], shape (B, 3).
             rotation: Wanted rotation matrices, shape (B, 3, 3).
-            start: Where the iteration begins, shape (n,).
+            start: Where the iteration begins, shape (n,) or (B, n).
             iterations: How many steps at most.
             length: By how much a rotation error counts [m/rad].
 
@@ -124,7 +129,7 @@ class SerialChain:
             The coordinates, shape (B, n), and the error that is left [m], shape (B,).
         """
         low, high = self.span
-        q = self.followed(np.tile(np.clip(start, low, high), (len(position), 1)))
+        q = self.followed(np.array(np.broadcast_to(np.clip(start, low, high), (len(position), len(low)))))
         weight = np.array([1.0] * 3 + [length] * 3)[:, None]
         moving = np.arange(len(q))
         for _ in range(iterations):

@@ -37,8 +37,12 @@ _SHARES = (1.0, 0.75, 0.5, 0.3)
 """Shares of the ranges that are tried in turn."""
 _HEIGHTS = (0.0, 0.15, 0.3, 0.45)
 """How high above the table the base is tried, in turn [m]."""
+_FREE = 5.7
+"""Range of an upright first joint from which on the base needs not be turned [rad]."""
 _LOW = 0.13
 """Lowest tool position of the home pose that a robot of small reach gets [m]: over what stands on the table."""
+_BENT = ((0.0, -1.0, 1.0, -1.0, -1.0, 0.0), (0.0, -1.0, -1.0, 1.0, 1.0, 0.0), (0.0, 0.3, 0.0, -1.0, 0.0, 1.0))
+"""Poses in which the search begins, in quarters of the ranges of the joints: shoulder, elbow and wrist bent."""
 _STUCK = 0.5e-3
 """How far dry friction of its joints may hold a finger from where its drive aims [m]."""
 
@@ -238,6 +242,12 @@ def place_robot(
             f"robot {robot.name!r} has {len(chain.joints)} joints between base and tool, expected 5 to {JOINT_MAX}",
             hint="write control.joint_target_q yourself, see RobotDescription.with_opening",
         )
+    loose = [robot.joint_names[j] for j in chain.joints if robot.drives[j] is None]
+    if loose:
+        raise ConfigError(
+            f"joints between base and tool of robot {robot.name!r} have no drive: {', '.join(loose)}",
+            hint="give each an actuator in the file; a base that floats is held with load(..., floating=False)",
+        )
     # The fingers may change sides: half a turn about the tool, which may free the last joint's range.
     half = Rotation.from_quat(jaw.frame[3:]) * Rotation.from_rotvec([0.0, 0.0, np.pi])
     other = (*jaw.frame[:3], *half.as_quat().tolist())
@@ -347,7 +357,7 @@ def _placed(
     and leaves the last joint room to turn the tool.
     """
     chain = serial_chain(robot, jaw.frame)
-    at_home, error = _reach(chain, np.array(bases), np.tile(points[0], (len(bases), 1)), yaw[:1], chain.home)
+    at_home, error = _reach(chain, np.array(bases), np.tile(points[0], (len(bases), 1)), yaw[:1], chain.home, bent=True)
     reached = error <= _NEAR
     for some in (slice(3, None), slice(1, 3)):  # the places are what most bases do not reach
         left = np.flatnonzero(reached)
@@ -355,7 +365,8 @@ def _placed(
             return None
         count = len(points[some])
         rows, turns = np.tile(points[some], (len(left), 1)), np.tile(yaw[some], len(left))
-        _, error = _reach(chain, np.repeat(np.array(bases)[left], count, axis=0), rows, turns, chain.home)
+        starts = np.repeat(at_home[left], count, axis=0)
+        _, error = _reach(chain, np.repeat(np.array(bases)[left], count, axis=0), rows, turns, starts)
         reached[left] = (error.reshape(-1, count) <= _NEAR).all(axis=1)
     middles = []
     for turn in dict.fromkeys(one[3] for one in bases):
@@ -372,38 +383,52 @@ def _placed(
 
 def _bases(chain: SerialChain, over: Sequence[float], up: float) -> list[Any]:
     """Return places of the base: at a height, at several distances on the near side, turned by quarter turns."""
+    low, high = chain.span
+    # The first joint of most arms turns the base by itself.
+    free = abs(chain.axis[0, 2]) > 0.99 and not chain.slide[0] and high[0] - low[0] > _FREE
     return [
         (float(over[0] - share * chain.reach), float(over[1]), up, turn)
-        for turn in (0.0, 0.5 * math.pi, -0.5 * math.pi, math.pi)
+        for turn in ((0.0,) if free else (0.0, 0.5 * math.pi, -0.5 * math.pi, math.pi))
         for share in np.linspace(0.25, 0.95, 15)
     ]
 
 
-def _reach(chain: SerialChain, base: Array, points: Array, yaw: Array, start: Array) -> tuple[Array, Array]:
+def _reach(
+    chain: SerialChain, base: Array, points: Array, yaw: Array, start: Array, *, bent: bool = False
+) -> tuple[Array, Array]:
     """Return coordinates that hold the tool at points of the world, pointing down, and what is missing [m].
 
-    The iteration begins in the home pose, then in two other ones for what was not reached.
+    The iteration begins in the home pose, then in other ones for what was not reached. A joint below the table's top
+    counts as not reached.
 
     Args:
         chain: The chain in the base frame.
         base: Where the base stands for each point, x, y, z [m] and rotation [rad], shape (N or 1, 4).
         points: The points, shape (N, 3).
         yaw: Rotation of the tool about the vertical there [rad], shape (N,).
-        start: The home pose.
+        start: The home pose, shape (n,) or (N, n).
+        bent: Whether more poses are tried: with the elbow up, down and to the sides.
     """
     base, yaw = np.broadcast_to(base, (len(points), 4)), np.broadcast_to(yaw, len(points))
     local = _about_z(-base[:, 3]).apply(points - base[:, :3])
     turns = _about_z(yaw - base[:, 3]).as_matrix() @ _DOWN
     low, high = chain.span
-    starts = [start, np.clip(0.5 * (low + high), low, high)]
-    bent = starts[1].copy()
-    bent[1::2] += 0.25 * (high - low)[1::2]
-    q, error = chain.inverse(local, turns, starts[0], iterations=80)
-    for other in (starts[1], bent):
+    middle, quarter = 0.5 * (low + high), 0.25 * (high - low)
+    odd = np.arange(len(low)) % 2
+    starts = [middle, middle + quarter * odd]
+    if bent:
+        starts += [middle + quarter * np.resize(signs, len(low)) for signs in _BENT]
+
+    def solved(rows: Array, begin: Array) -> tuple[Array, Array]:
+        q, error = chain.inverse(local[rows], turns[rows], begin, iterations=80)
+        return q, np.where(chain.lowest(q) + base[rows, 2] < 0.0, np.inf, error)
+
+    q, error = solved(np.arange(len(points)), start)
+    for other in starts:
         left = np.flatnonzero(error > _NEAR)
         if not len(left):
             break
-        again, missing = chain.inverse(local[left], turns[left], other, iterations=80)
+        again, missing = solved(left, other)
         better = missing < error[left]
         q[left[better]], error[left[better]] = again[better], missing[better]
     return q, error
