@@ -319,7 +319,7 @@ class CompiledRobot:
         In the home pose; where that is zero, also in a bent one: the larger number of both.
         """
         poses = [self.home(None)]
-        if not np.any(poses[0]):  # a straight arm: what its axes carry stands off them once it bends
+        if not any(self.at_home.values()):  # a straight arm: what its axes carry stands off them once it bends
             low, high = np.maximum(self.lower, -math.pi), np.minimum(self.upper, math.pi)
             hinge = self.model.jnt_type == int(self.mujoco.mjtJoint.mjJNT_HINGE)
             poses.append(np.where(hinge, np.clip(0.25 * math.pi, 0.75 * low + 0.25 * high, high), 0.0))
@@ -330,10 +330,11 @@ class CompiledRobot:
 
     def _default_drive(self, j: int, limit: float) -> JointDrive:
         """Return a critically damped drive for a joint without servo."""
-        mass, omega = self._inertias[j], 2.0 * math.pi * self.bandwidth
+        mass, omega, loss = self._inertias[j], 2.0 * math.pi * self.bandwidth, self.model.dof_damping[j]
         return JointDrive(
-            stiffness=float(mass * omega**2),
-            damping=float(max(2.0 * mass * omega - self.model.dof_damping[j], 0.0)),
+            # Against much viscous friction the joint would creep to its target.
+            stiffness=float(max(mass * omega**2, 0.5 * loss * omega)),
+            damping=float(max(2.0 * mass * omega - loss, 0.0)),
             effort_limit=limit,
             lower=float(self.lower[j]),
             upper=float(self.upper[j]),

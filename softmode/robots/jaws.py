@@ -21,6 +21,8 @@ Array = NDArray[np.float64]
 _FACE = 0.002
 """How far behind the foremost point of a finger its face reaches [m]: pads are rounded, and some are tilted."""
 
+_USUAL = 0.06
+"""Width of what is usually grasped [m]."""
 _TIP = 0.01
 """How far behind the tip of a finger a link may end that counts as its pad [m]."""
 
@@ -148,7 +150,9 @@ def _measured(robot: RobotDescription) -> ParallelJaw:
     pads = [left[left[:, 1] < face[0] + _FACE], right[right[:, 1] > face[1] - _FACE]]
     low = np.max([pad.min(0) for pad in pads], axis=0)
     high = np.min([pad.max(0) for pad in pads], axis=0)
-    tips = min(left[:, 2].max(), right[:, 2].max())
+    # The fingers of linkages come out as they close: the table is what they must not reach then.
+    poses = (wide, _kinematics(robot, model, min(_USUAL / opening, 1.0)))
+    tips = max(min(float((surface_corners(model, pose, side) @ turn[:, 2]).max()) for side in sides) for pose in poses)
     whole = fingers[0] @ turn
     beside = whole[whole[:, 2] >= min(low[2], high[2]) - 1e-9]
     base = base @ turn

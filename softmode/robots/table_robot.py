@@ -43,6 +43,8 @@ _LOW = 0.13
 """Lowest tool position of the home pose that a robot of small reach gets [m]: over what stands on the table."""
 _BENT = ((0.0, -1.0, 1.0, -1.0, -1.0, 0.0), (0.0, -1.0, -1.0, 1.0, 1.0, 0.0), (0.0, 0.3, 0.0, -1.0, 0.0, 1.0))
 """Poses in which the search begins, in quarters of the ranges of the joints: shoulder, elbow and wrist bent."""
+_ROOM = 0.1
+"""How far every joint of the home pose should be from the ends of its range [rad]."""
 _STUCK = 0.5e-3
 """How far dry friction of its joints may hold a finger from where its drive aims [m]."""
 
@@ -425,11 +427,14 @@ def _reach(
 
     q, error = solved(np.arange(len(points)), start)
     for other in starts:
-        left = np.flatnonzero(error > _NEAR)
+        # Where a pose is chosen to begin with, one at the end of a joint's range serves only if there is no other.
+        tight = error + _NEAR * (np.minimum(q - low, high - q).min(axis=1) < _ROOM) if bent else error
+        left = np.flatnonzero(tight > _NEAR)
         if not len(left):
             break
         again, missing = solved(left, other)
-        better = missing < error[left]
+        more = missing + _NEAR * (np.minimum(again - low, high - again).min(axis=1) < _ROOM) if bent else missing
+        better = more < tight[left]
         q[left[better]], error[left[better]] = again[better], missing[better]
     return q, error
 
