@@ -106,12 +106,13 @@ def with_robot(config: Config, robot: Robot) -> Config:
         control = replace(control, workspace_lower=lower, workspace_upper=upper)
     # Loops and joint limits of a gripper take rows of their own.
     more = len(robot.robot.joint_names) + 6 * robot.robot.mjcf.count("<connect")
+    shapes = int(np.count_nonzero(robot.robot.model.geom_contype))
     scene = replace(
         scene,
         arm=robot,
         control=control,
         constraint_max=max(scene.constraint_max, 64) + 2 * more,
-        rigid_contact_max=max(scene.rigid_contact_max, 64),
+        rigid_contact_max=max(scene.rigid_contact_max, 64) + 3 * shapes,  # pairs that come near count as well
     )
     if config.samples_for_tips:
         scene = replace(scene, object=_sampled_for(scene.object, robot.jaw))

@@ -211,7 +211,8 @@ def _fingers(robot: RobotDescription, model: Any) -> tuple[list[int], list[int]]
         ends = [_kinematics(robot, model, opening) for opening in (0.0, 1.0)]
         sides = opposed(*ends, sides)
     if len(sides) != 2:
-        raise ConfigError(f"robot {robot.name!r} has {len(roots)} driven fingers, not two", hint=_HINT)
+        fixed = " (one that moves against a jaw that does not)" if len(roots) == 1 else ""
+        raise ConfigError(f"robot {robot.name!r} has {len(roots)} driven fingers{fixed}, not two", hint=_HINT)
     first, second = (sorted(side) for side in sides)
     return first, second
 

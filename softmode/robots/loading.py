@@ -217,7 +217,7 @@ def _read(asset: RobotAsset) -> tuple[Any, list[str]]:
             f"robot file {asset.path} starts with <{tree.tag}>", hint="MJCF starts with <mujoco>, URDF with <robot>"
         )
     if not asset.trusted:
-        process.read("model", asset.path, name=f"robot file {asset.path}", text=text, size=size)
+        process.read("model", asset.path, name=f"robot file {asset.path}", text=text, size=2 * size)
     try:
         return open_spec(str(asset.path), text), notes
     except (ValueError, RuntimeError) as error:
