@@ -364,13 +364,5 @@ class CompiledRobot:
             )
         if not given:
             return None, link
-        owner, ratio, shift = self.bound
-        given = {name: (float(pair[0]), float(pair[1])) for name, pair in given.items()}
-        for name, pair in list(given.items()):
-            i = self.joint_names.index(name)
-            for j in range(len(owner)):
-                if owner[j] == owner[i] and self.joint_names[j] not in given and drives[j] is not None:
-                    ends = [shift[j] + ratio[j] * (q - shift[i]) / ratio[i] for q in pair]
-                    given[self.joint_names[j]] = (ends[0], ends[1])
         closed, wide = ([float(pair[k]) for pair in given.values()] for k in (0, 1))
         return RobotGripper(joints=tuple(given), closed=tuple(closed), open=tuple(wide)), palm

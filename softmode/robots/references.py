@@ -29,8 +29,8 @@ _NESTED_TAGS = ("include", "model")
 """Elements whose file is itself a model."""
 _LEVELS = 8
 """How many folders above a robot file its packages are looked for in."""
-_MODEL_FOLDERS = ("urdf", "urdfs", "robots", "mjcf", "xml", "xmls", "models")
-"""Names of folders of a package that hold robot files alone; meshes lie beside them."""
+_MODEL_FOLDERS = {".urdf": ("urdf", "urdfs", "robots"), ".xml": ("mjcf", "xml", "xmls", "robots")}
+"""Names of folders of a package that hold robot files of a kind alone; meshes lie beside them."""
 
 
 def read_xml(path: Path) -> ElementTree.Element:
@@ -204,13 +204,16 @@ def package_folder(name: str, rest: str, file: Path) -> Path | None:
 
 
 def default_root(file: Path) -> Path:
-    """Return the folder that a robot file may refer to: its own, or its package's.
+    """Return the folder that a robot file may refer to: its own, or the one above if its own is for such files alone.
 
-    That is the one above if its own holds robot files alone, or one further above that has a `package.xml`.
+    An MJCF file, which names no packages, may refer to the folder further above that has a `package.xml`.
     """
-    folder = file.parent
-    package = next((up for up in list(folder.parents)[:_LEVELS] if (up / "package.xml").is_file()), None)
-    return package or (folder.parent if folder.name in _MODEL_FOLDERS else folder)
+    folder, urdf = file.parent, file.suffix.lower() == ".urdf"
+    if not urdf:
+        for up in list(folder.parents)[:_LEVELS]:
+            if (up / "package.xml").is_file():
+                return up
+    return folder.parent if folder.name in _MODEL_FOLDERS[".urdf" if urdf else ".xml"] else folder
 
 
 def _package_name(folder: Path) -> str | None:

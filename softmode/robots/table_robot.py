@@ -158,12 +158,12 @@ class TableRobot:
         """Add the robot in its home pose to a builder; `xform` places its base elsewhere."""
         newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
         if self.base[2] > 0.0 and xform is None:  # a pedestal, only to be seen
-            place = wp.transform(wp.vec3(*self.base[:2], 0.5 * self.base[2]), wp.quat_identity())
+            x, y, z = self.base[:3]
             config = newton.ModelBuilder.ShapeConfig(density=0.0, has_shape_collision=False)
             config.has_particle_collision = False
-            half = (0.08, 0.08, 0.5 * self.base[2])
-            color = (0.30, 0.31, 0.33)
-            builder.add_shape_box(-1, place, *half, cfg=config, color=color, label=f"{label}/pedestal")
+            look = {"color": (0.30, 0.31, 0.33), "label": f"{label}/pedestal"}
+            place = wp.transform(wp.vec3(x, y, 0.5 * z), wp.quat_identity())
+            builder.add_shape_box(-1, xform=place, hx=0.08, hy=0.08, hz=0.5 * z, cfg=config, **look)
         return self.robot.add_to(builder, xform=base_pose(self.base) if xform is None else xform, label=label)
 
 
