@@ -13,9 +13,9 @@ from softmode.envs.robots import with_robot
 from softmode.envs.scripted import scripted_policy
 from softmode.envs.tasks.lift_soft.scripted import ScriptedLift
 from softmode.envs.tasks.lift_soft.task import LiftSoftConfig, LiftSoftEnv, LiftSoftVectorEnv
-from softmode.envs.tasks.place_in_bin.task import RopeRouteEnv
 from softmode.envs.tasks.press_soft.task import PressSoftConfig, PressSoftEnv
 from softmode.envs.tasks.push_soft.task import PushSoftConfig, PushSoftEnv
+from softmode.envs.tasks.rope_route.task import RopeRouteEnv
 from softmode.errors import ConfigError
 from softmode.robots.table_robot import TableRobot, tip_length
 from tests.robots.files import ARM5, MJCF, write_arm5, write_mjcf
