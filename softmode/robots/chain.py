@@ -205,7 +205,7 @@ def serial_chain(robot: RobotDescription, frame: ToolPose = (0.0, 0.0, 0.0, 0.0,
     if not joints:
         raise ConfigError(
             f"no joint moves the end effector {robot.end_effector!r} of robot {robot.name!r}",
-            hint="name a link or site at the end of an arm: end_effector=; a hand alone goes upon one: load(arm, hand=...)",
+            hint="name a link or site at the end of an arm, or put the hand upon one: load(arm, hand=...)",
         )
     mount = data.xmat[end].reshape(3, 3)
     inside = Rotation.from_quat(robot.tool[3:])

@@ -235,7 +235,7 @@ def place_robot(
     if robot.gripper is None:
         raise ConfigError(
             f"robot {robot.name!r} has no gripper, which this task needs",
-            hint="name its joints: load(..., gripper={'joint': (closed, open)}), or put a hand upon it: load(..., hand=)",
+            hint="name its joints: load(..., gripper={'joint': (closed, open)}), or give it a hand: load(..., hand=)",
         )
     jaw = ParallelJaw.of(robot)
     chain = serial_chain(robot, jaw.frame)
