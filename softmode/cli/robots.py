@@ -116,12 +116,14 @@ def task_lines(robot: RobotDescription) -> list[str]:
     from softmode import ENVIRONMENTS
     from softmode.envs.arguments import Shortcuts, checked_config
     from softmode.envs.catalogue import env_class
+    from softmode.robots.table_robot import TableRobot
 
     lines = []
     for name in ENVIRONMENTS:
         task = env_class(name).task_class
         try:
             arm = checked_config(task.config_class, None, Shortcuts(robot=robot), task.any_robot).scene.arm
+            assert isinstance(arm, TableRobot)
             x, y, z, turn = arm.base
             said = f"yes, from ({x:.2f}, {y:.2f}, {z:.2f}) m turned by {math.degrees(turn):.0f} deg"
             said += f", in {100 * arm.share:.0f} % of its ranges" if arm.share < 1.0 else ""

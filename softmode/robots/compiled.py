@@ -11,6 +11,7 @@ not that of actuators:
 
 from __future__ import annotations
 
+import copy
 import functools
 import importlib
 import math
@@ -275,7 +276,7 @@ class CompiledRobot:
                 circle are refused.
         """
         count = self.model.njnt
-        owner, ratio, shift = map(list, before or (range(count), [1.0] * count, [0.0] * count))
+        owner, ratio, shift = copy.deepcopy(before) if before else (list(range(count)), [1.0] * count, [0.0] * count)
         for joint, leader, offset, slope in ties:
             if owner[joint] == owner[leader] and before is not None:
                 continue

@@ -145,7 +145,8 @@ def closing_ends(
     driven = [(j, drive) for j in joints if (drive := drives[j]) is not None]
     sides = [set(side) for side in fingers.values()]
     if len(sides) > 2 and len({owner[j] for j, _ in driven}) == 1:
-        sides = opposed(*(posed(driven[0][0], q) for q in (driven[0][1].lower, driven[0][1].upper)), sides)
+        j, drive = driven[0]
+        sides = opposed(posed(j, drive.lower), posed(j, drive.upper), sides)
     for j, drive in driven:
         first = next(i for i in joints if owner[i] == owner[j])
         own = next(sorted(side) for side in sides if _branch(model, palm, j) in side)

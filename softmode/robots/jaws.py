@@ -208,8 +208,7 @@ def _fingers(robot: RobotDescription, model: Any) -> tuple[list[int], list[int]]
         sides.append(own | set(side_of(model, palm, root)))
     leaders = {tie.joint: tie.leader for tie in robot.ties}
     if len(sides) > 2 and len({leaders.get(name, name) for name in joints}) == 1:
-        ends = [_kinematics(robot, model, opening) for opening in (0.0, 1.0)]
-        sides = opposed(*ends, sides)
+        sides = opposed(_kinematics(robot, model, 0.0), _kinematics(robot, model, 1.0), sides)
     if len(sides) != 2:
         fixed = " (one that moves against a jaw that does not)" if len(roots) == 1 else ""
         raise ConfigError(f"robot {robot.name!r} has {len(roots)} driven fingers{fixed}, not two", hint=_HINT)

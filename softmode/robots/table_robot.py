@@ -421,7 +421,7 @@ def _reach(
     if bent:
         starts += [middle + quarter * np.resize(signs, len(low)) for signs in _BENT]
 
-    def solved(rows: Array, begin: Array) -> tuple[Array, Array]:
+    def solved(rows: NDArray[np.int64], begin: Array) -> tuple[Array, Array]:
         q, error = chain.inverse(local[rows], turns[rows], begin, iterations=80)
         return q, np.where(chain.lowest(q) + base[rows, 2] < 0.0, np.inf, error)
 
