@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -14,12 +15,10 @@ import warp as wp
 from numpy.typing import NDArray
 
 from softmode.checks import require_choice
-from softmode.envs.robots import with_robot
+from softmode.envs.robots import Robot, with_robot
 from softmode.envs.task_config import ObservationType, TaskConfig
 from softmode.errors import ConfigError
 from softmode.objects.config import ObjectConfig
-from softmode.robots.description import RobotDescription
-from softmode.robots.table_robot import TableRobot
 
 CONTROL_MODES = ("pose_delta", "joint_delta")
 RENDER_MODES = ("rgb_array",)
@@ -41,8 +40,8 @@ class Shortcuts:
     """Longest edge of the object [m]."""
     preset: str | None = None
     """Named variant of the task, instead of a configuration."""
-    robot: str | Path | RobotDescription | TableRobot | None = None
-    """Robot instead of the built-in arm: a name, a file, or a loaded one."""
+    robot: Robot | None = None
+    """Robot instead of the built-in arm: a name, a file, arguments of `softmode.robots.load`, or a loaded one."""
 
 
 def checked_config(
@@ -88,9 +87,13 @@ def checked_config(
     if given.robot is None:
         return config
     if not any_robot:
+        low, high = config.scene.control.workspace_lower, config.scene.control.workspace_upper
+        far = math.hypot(max(abs(low[0]), abs(high[0])), max(abs(low[1]), abs(high[1])))
         raise ConfigError(
-            f"robot given for a task of {wanted.__name__}, which plays with the built-in arm only",
-            hint="LiftSoft, PushSoft and PressSoft take any robot; docs/howto/own_robot.md has a scene of your own",
+            f"robot given for a task of {wanted.__name__}, which plays with the built-in arm only: it needs a reach "
+            f"of {far:.2f} m along the table with the tool {low[2]:.2f} to {high[2]:.2f} m above it",
+            hint="LiftSoft, PushSoft, PressSoft and PlaceInBin take any robot; docs/howto/own_robot.md has a scene of "
+            "your own",
         )
     return with_robot(config, given.robot)
 

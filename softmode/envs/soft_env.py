@@ -34,13 +34,12 @@ from softmode.envs.env_state import (
 )
 from softmode.envs.parameters import check_options
 from softmode.envs.results import host_view, info_arrays, name_of, observation_arrays, take, write
+from softmode.envs.robots import Robot
 from softmode.envs.task import Task
 from softmode.envs.task_config import ObservationType, TaskConfig
 from softmode.envs.tensors import map_tree
 from softmode.errors import ConfigError
 from softmode.pause import collector_paused
-from softmode.robots.description import RobotDescription
-from softmode.robots.table_robot import TableRobot
 
 
 class SoftEnv(gym.Env, gym.utils.EzPickle):
@@ -82,8 +81,8 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
         splat: Splat file of the object; None for the built-in one.
         size: Longest edge of the object [m].
         preset: Named variant of the task, instead of `config`.
-        robot: Robot instead of the built-in arm: a name of `softmode.robots.available`, a file, a `RobotDescription`,
-            or a `TableRobot` that `softmode.robots.place_robot` put at the table.
+        robot: Robot instead of the built-in arm: a name of `softmode.robots.available`, a file, arguments of
+            `softmode.robots.load` by name, a `RobotDescription`, or a `TableRobot` of `softmode.robots.place_robot`.
         config: Everything else.
         device: Warp device.
         progress: Reports the build of the object: a callable (stage, fraction), or True or False for a bar or none.
@@ -107,7 +106,7 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
         splat: str | Path | None = None,
         size: float | None = None,
         preset: str | None = None,
-        robot: str | Path | RobotDescription | TableRobot | None = None,
+        robot: Robot | None = None,
         config: TaskConfig | None = None,
         device: wp.DeviceLike = None,
         progress: bool | Progress | None = None,

@@ -32,13 +32,12 @@ from softmode.envs.arguments import (
 from softmode.envs.env_state import EnvState, checked_state, generator_of, generator_state
 from softmode.envs.parameters import check_options
 from softmode.envs.results import add_object_names, named_reasons
+from softmode.envs.robots import Robot
 from softmode.envs.task import Task
 from softmode.envs.task_config import ObservationType, TaskConfig
 from softmode.envs.tensors import Tensor, host_array, map_tree
 from softmode.envs.worlds import LocalWorlds, RemoteWorlds
 from softmode.errors import ConfigError, MissingExtraError
-from softmode.robots.description import RobotDescription
-from softmode.robots.table_robot import TableRobot
 
 Output = Literal["numpy", "torch"]
 
@@ -61,8 +60,8 @@ class SoftVectorEnv(gym.vector.VectorEnv):
         splat: Splat file of the object; None for the built-in one.
         size: Longest edge of the object [m].
         preset: Named variant of the task, instead of `config`.
-        robot: Robot instead of the built-in arm: a name of `softmode.robots.available`, a file, a `RobotDescription`,
-            or a `TableRobot` that `softmode.robots.place_robot` put at the table.
+        robot: Robot instead of the built-in arm: a name of `softmode.robots.available`, a file, arguments of
+            `softmode.robots.load` by name, a `RobotDescription`, or a `TableRobot` of `softmode.robots.place_robot`.
         config: Everything else.
         max_episode_steps: Control steps after which an episode is truncated; None for never.
         autoreset_mode: When the next episode of a world begins.
@@ -92,7 +91,7 @@ class SoftVectorEnv(gym.vector.VectorEnv):
         splat: str | Path | None = None,
         size: float | None = None,
         preset: str | None = None,
-        robot: str | Path | RobotDescription | TableRobot | None = None,
+        robot: Robot | None = None,
         config: TaskConfig | None = None,
         max_episode_steps: int | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,

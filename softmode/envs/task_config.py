@@ -124,6 +124,10 @@ class TaskConfig:
         moved = replace(given, first_world=given.first_world + first)
         return replace(self, objects=moved, scene=replace(self.scene, objects=None))
 
+    def spots(self) -> tuple[tuple[float, float, float], ...]:
+        """Return places that a robot must reach beside the random ones [m]: the task does not move them."""
+        return ()
+
     @classmethod
     def preset(cls, name: str) -> Self:
         """Return a named variant of the task.

@@ -34,8 +34,8 @@ _NESTED_TAGS = ("include", "model")
 """Elements whose file is itself a model."""
 _LEVELS = 8
 """How many folders above a robot file its packages are looked for in."""
-_URDF_FOLDERS = ("urdf", "urdfs", "robots")
-"""Names of folders of a package that hold URDF files alone; meshes lie beside them."""
+_MODEL_FOLDERS = {".urdf": ("urdf", "urdfs", "robots"), ".xml": ("mjcf", "xml", "xmls", "robots")}
+"""Names of folders of a package that hold robot files of a kind alone; meshes lie beside them."""
 
 
 def read_xml(path: Path) -> ElementTree.Element:
@@ -172,7 +172,7 @@ def resolve_package(whole: str, file: Path, root: Path, given: bool) -> Path:
     """Return the file that a reference `package://NAME/PATH` means.
 
     It is looked for in the asset root, and in the folder of the package: one above the file or beside what lies above
-    it, whose `package.xml` has that name.
+    it, whose `package.xml` has that name, or which has that name and a `package.xml`.
 
     Args:
         whole: What stands behind `package://`.
@@ -199,15 +199,23 @@ def package_folder(name: str, rest: str, file: Path) -> Path | None:
         return None
     for up in list(file.resolve().parents)[:_LEVELS]:
         for folder in (up / name, up):
-            if _package_name(folder) == name and (folder / rest).exists():
+            found = _package_name(folder)
+            if (found == name or (found is not None and folder.name == name)) and (folder / rest).exists():
                 return folder
     return None
 
 
 def default_root(file: Path) -> Path:
-    """Return the folder that a URDF may refer to: its own, or the one above if its own is one for URDF files."""
-    folder = file.parent
-    return folder.parent if folder.name in _URDF_FOLDERS else folder
+    """Return the folder that a robot file may refer to: its own, or the one above if its own is for such files alone.
+
+    An MJCF file, which names no packages, may refer to the folder further above that has a `package.xml`.
+    """
+    folder, urdf = file.parent, file.suffix.lower() == ".urdf"
+    if not urdf:
+        for up in list(folder.parents)[:_LEVELS]:
+            if (up / "package.xml").is_file():
+                return up
+    return folder.parent if folder.name in _MODEL_FOLDERS[".urdf" if urdf else ".xml"] else folder
 
 
 def _package_name(folder: Path) -> str | None:
