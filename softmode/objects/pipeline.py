@@ -32,7 +32,7 @@ from softmode.splats.splats import Splats
 
 Array = NDArray[np.float64]
 
-RECIPE = 7
+RECIPE = 8
 """Part of the cache key; raise it when the way from a file or shape to a body changes."""
 SIZE_TOLERANCE = 0.02
 """Relative error of the size of a fill that is left: bumps of that height lie on its surface."""
