@@ -190,7 +190,7 @@ def damage_errors(what: str, *, hint: str, error: type[SoftmodeError] = AssetErr
         if isinstance(caught, error):
             raise
         raise error(f"{what}: {caught.message}", hint=caught.hint or hint) from caught
-    except SoftmodeError:
+    except (SoftmodeError, Warning):
         raise
     except FileNotFoundError as caught:
         raise error(f"{what}: does not exist", hint=hint) from caught

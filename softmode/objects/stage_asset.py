@@ -9,6 +9,7 @@ import numpy as np
 
 from softmode.errors import AssetError
 from softmode.foreign import process
+from softmode.foreign.child.surface import near_zero
 from softmode.objects.soft_object import SoftObject
 from softmode.objects.stage_bundle import body_of
 from softmode.objects.stage_geometry import SurfaceMesh, mesh_surface, tet_surface
@@ -88,8 +89,10 @@ def colored_mesh(surfaces: list[SurfaceMesh], name: str) -> ColoredMesh:
     linear = np.concatenate([mesh.colors[mesh.faces] for mesh in surfaces])
     encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0) ** (1.0 / 2.4) - 0.055)
     count = len(linear)
+    corners, offset = near_zero(np.concatenate([mesh.vertices[mesh.faces] for mesh in surfaces]).reshape(-1, 3))
     return ColoredMesh(
-        corners=np.concatenate([mesh.vertices[mesh.faces] for mesh in surfaces]).astype(np.float32),
+        corners=corners.reshape(-1, 3, 3).astype(np.float32),
+        offset=offset,
         corner_colors=encoded.astype(np.float32),
         corner_uvs=np.zeros((count, 3, 2), np.float32),
         texture_index=np.full(count, -1, np.int32),

@@ -310,7 +310,7 @@ def _splats(prim: dict[str, Any], arrays: list[NDArray[Any]], frame: StageFrame,
     if frame.meters != 1.0 or not np.array_equal(frame.up, np.eye(3)):
         part = part.transformed(rotation=frame.up, scale=frame.meters)
     relative = _snapped(into @ frame.matrix(prim["matrix"]))
-    return part if np.array_equal(relative, np.eye(4)) else placed(part, relative)
+    return part if np.array_equal(relative, np.eye(4)) and not any(part.offset) else placed(part, relative)
 
 
 def _snapped(matrix: Array) -> Array:
