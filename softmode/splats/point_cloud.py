@@ -167,7 +167,7 @@ def splats_from_points(
     with np.errstate(invalid="ignore"):
         good = (np.abs(x) < _FAR).all(axis=1)
     if len(x) and not good.all():
-        told += count_dropped(name, good, "points")
+        told += count_dropped(name, {"not finite": good}, "points")
         colors = colors if colors is None or len(colors) != len(x) else colors[good]
         x, normals = x[good], None if normals is None else normals[good]
     x, offset = near_zero(x)

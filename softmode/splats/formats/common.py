@@ -93,23 +93,25 @@ def offset_note(offset: Sequence[float]) -> list[str]:
     return ["coordinates are counted from ({:g}, {:g}, {:g}) on, the offset".format(*offset)] if any(offset) else []
 
 
-def count_dropped(name: str, good: NDArray[np.bool_], what: str = "splats") -> list[str]:
+def count_dropped(name: str, good: dict[str, NDArray[np.bool_]], what: str = "splats") -> list[str]:
     """Return a note on rows that are dropped; a warning says it too if there are many, an error if none is left.
 
     Args:
         name: The file as messages call it.
-        good: Which rows stay, shape (N,).
+        good: Which rows are sound, shape (N,), by what they would otherwise be.
         what: What a row is.
     """
-    bad = int((~good).sum())
-    if not bad:
+    kept = np.logical_and.reduce(list(good.values()))
+    if (bad := int((~kept).sum())) == 0:
         return []
-    remedy = f"`softmode splat convert {name.rpartition(' file ')[2]} CLEAN.ply --drop-invalid` writes the others"
-    if bad == len(good):
-        raise AssetError(f"{name}: none of {bad} {what} is finite and has a rotation and a size", hint=REEXPORT)
-    note = f"{bad} of {len(good)} {what} dropped (not finite, or without rotation or size)"
-    if bad > DROPPED_SHARE * len(good):
-        hint = remedy if what == "splats" else "export it again without them"
+    why = ", ".join(f"{int((~sound).sum())} {problem}" for problem, sound in good.items() if not sound.all())
+    if not kept.any():
+        raise AssetError(f"{name}: none of {len(kept)} {what} is sound ({why})", hint=REEXPORT)
+    note = f"{bad} of {len(kept)} {what} dropped ({why})"
+    if bad > DROPPED_SHARE * len(kept):
+        remedy = "`softmode splat convert {} CLEAN.ply --drop-invalid` writes the others"
+        path = name.removeprefix("splat file ")
+        hint = remedy.format(path) if what == "splats" else "export it again without them"
         warnings.warn(f"{name}: {note}; {hint}", stacklevel=5)
     return [note]
 
@@ -146,13 +148,18 @@ def sound_splats(
     if sh.shape[1] > 16:
         told.append(f"spherical harmonics of degree {int(np.sqrt(sh.shape[1])) - 1} are cut to degree 3")
         sh = sh[:, :16]
+    columns = {"means": means, "scales": scales, "opacities": opacity, "colours": sh}
     with np.errstate(over="ignore", invalid="ignore"):
-        good = np.isfinite(opacity) & (np.linalg.norm(quats.astype(np.float64), axis=1) > 1e-8)
-        for value in (means, quats, scales, sh.reshape(len(sh), -1)):
-            good &= np.isfinite(value.astype(np.float32)).all(axis=1)
-        good &= (scales >= 0.0).all(axis=1) & (scales.max(axis=1, initial=0.0) > 0.0)
-    if not good.all():
-        told += count_dropped(name, good)
+        length = np.linalg.norm(quats.astype(np.float64), axis=1)
+        sound = {
+            f"with {field} not finite": np.isfinite(value.reshape(len(means), -1).astype(np.float32)).all(axis=1)
+            for field, value in columns.items()
+        }
+        sound["without a rotation"] = np.isfinite(length) & (length > 1e-8)
+        sound["without a size"] = ~((scales < 0.0).any(axis=1) | (scales.max(axis=1, initial=0.0) <= 0.0))
+    count, dropped = len(means), count_dropped(name, sound)
+    if dropped:
+        good, told = np.logical_and.reduce(list(sound.values())), told + dropped
         means, quats, scales, opacity, sh = (value[good] for value in (means, quats, scales, opacity, sh))
     if (flat := (scales == 0.0).any(axis=1)).any():
         told.append(f"{int(flat.sum())} discs, with a scale of zero, get a thousandth of their next one")
@@ -171,7 +178,7 @@ def sound_splats(
         name=name,
         offset=offset,
         notes=(*told, *offset_note(offset)),
-        dropped_count=len(good) - len(means),
+        dropped_count=count - len(means),
     )
 
 
