@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -184,6 +185,7 @@ def scene_from_answer(answer: process.Answer, name: str) -> UsdScene:
     """
     stage = answer.described
     frame = stage_frame(stage, name)
+    notes = [*warned(stage["warnings"], name), *stage["notes"]]
     with process.invalid_data(name):
         bodies = tuple(_deformable(body, answer.arrays, frame, name) for body in stage["bodies"])
         scenery = [_splats(prim, answer.arrays, frame, np.eye(4), name) for prim in stage["scenery"]]
@@ -194,8 +196,15 @@ def scene_from_answer(answer: process.Answer, name: str) -> UsdScene:
         kilograms_per_unit=frame.kilograms,
         up_axis=stage["up"],
         scenery=joined(scenery, name) if scenery else None,
-        notes=tuple(stage["notes"]),
+        notes=tuple(notes),
     )
+
+
+def warned(texts: list[str], name: str) -> list[str]:
+    """Return what a stage is to be warned of, having warned of it."""
+    for text in texts:
+        warnings.warn(f"{name}: {text}", stacklevel=4)
+    return texts
 
 
 @dataclass(frozen=True)
@@ -279,6 +288,8 @@ def _deformable(body: dict[str, Any], arrays: list[NDArray[Any]], frame: StageFr
         meshes.append(
             mesh_surface(parts_of(mesh, arrays, frame), relative[:3, :3], f"{name}: {mesh['path']}", relative[:3, 3])
         )
+    for mesh in (*meshes, *((surface,) if surface is not None and not meshes and not pictures else ())):
+        notes += mesh.notes
     properties, sources = _properties(body, own)
     mass = body["mass"]
     if mass is None and "masses" in shape:
@@ -328,7 +339,20 @@ def parts_of(shape: dict[str, Any], arrays: list[NDArray[Any]], frame: StageFram
     found["points"] = frame.points(points)
     if "widths" in found:
         found["widths"] = frame.meters * found["widths"].astype(np.float64)
-    return {**found, "left_handed": shape["left_handed"]}
+    if "look" in shape:
+        found["look"] = _resolved(shape["look"], arrays)
+    return {**found, "path": shape["path"], "left_handed": shape["left_handed"]}
+
+
+def _resolved(look: dict[str, Any], arrays: list[NDArray[Any]]) -> dict[str, Any]:
+    """Return how a geometry looks, its arrays in place of their numbers."""
+
+    def of(given: Any) -> Any:
+        if isinstance(given, dict):
+            return {key: arrays[value] if type(value) is int else of(value) for key, value in given.items()}
+        return [of(one) if isinstance(one, dict) else one for one in given] if isinstance(given, list) else given
+
+    return of(look)
 
 
 def _properties(body: dict[str, Any], frame: StageFrame) -> tuple[dict[str, float], dict[str, str]]:

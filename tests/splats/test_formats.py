@@ -72,7 +72,7 @@ def test_ply_with_two_scales_uchar_and_crlf(tmp_path: Path) -> None:
     ("old", "new", "message"),
     [
         (b"binary_little_endian", b"binary", "expected binary_little_endian"),
-        (b"binary_little_endian", b"ascii", "the file holds fewer numbers"),
+        (b"binary_little_endian", b"ascii", "text that is no number"),
         (b"element vertex 50", b"element vertex 51", "the file holds"),
         (b"element vertex 50", b"element vertex 0", "0 splats"),
         (b"element vertex 50", b"element vertex 99999999999", "99999999999 splats"),

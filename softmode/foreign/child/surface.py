@@ -59,7 +59,7 @@ def gathered(source: Any, *, spent: bool = False) -> dict[str, Any]:
         if image is not None:
             chosen = known.setdefault(id(image), len(textures))
             if chosen == len(textures):
-                textures.append(_pixels(image, MAX_TEXELS - sum(texture.size // 3 for texture in textures)))
+                textures.append(decoded(image, MAX_TEXELS - sum(texture.size // 3 for texture in textures)))
                 if spent:
                     image.close()
         found.append((placed[faces], color, uv, np.full(len(faces), chosen, np.int32)))
@@ -122,7 +122,7 @@ def _gamma_encoded(linear: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055)
 
 
-def _pixels(image: Any, left: int) -> NDArray[np.uint8]:
+def decoded(image: Any, left: int) -> NDArray[np.uint8]:
     """Decode an image of at most so many pixels."""
     if image.width * image.height > left:
         text = f"a texture of {image.width} x {image.height} px, with the others more than {MAX_TEXELS} px"

@@ -206,9 +206,12 @@ class _Text:
     """Takes tables off numbers written as text."""
 
     def __init__(self, data: bytes, path: Path) -> None:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DeprecationWarning)  # of text that is none: the rest is counted as missing
-            self.values = np.fromstring(data.decode("ascii", "replace"), sep=" ")
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("error", DeprecationWarning)  # what older NumPy does about text that is no number
+                self.values = np.fromstring(data.decode("ascii", "replace"), sep=" ")
+        except (ValueError, DeprecationWarning) as error:
+            raise unreadable(path, "holds text that is no number") from error
         self.path, self.at = path, 0
 
     def take(self, element: Element) -> NDArray[Any]:

@@ -80,7 +80,8 @@ def _read_stage(file: Path, time_code: float | None) -> Splats:
     meters = float(stage["meters"])
     if not (np.isfinite(meters) and meters > 0.0):
         raise unreadable(file, f"metersPerUnit is {meters}", hint="Set it to the length of the unit in m")
-    return joined(parts, f"splat file {file}").transformed(rotation=up, scale=meters)
+    found = joined(parts, f"splat file {file}").transformed(rotation=up, scale=meters)
+    return replace(found, notes=(*found.notes, *stage["notes"]))
 
 
 def splats_from_prim(prim: dict[str, Any], sent: list[NDArray[Any]], name: str) -> Splats:
