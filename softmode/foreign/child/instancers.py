@@ -78,10 +78,12 @@ def _copy(prim: Prim, targets: list[object], time: object, before: int) -> int:
         raise Refused(f"{where} its prototype {missing[0]} does not exist", "Name prims in its prototypes")
     if before + len(indices) > MAX_COPIES:
         raise Refused(f"{where} more than {MAX_COPIES} copies with those of others", "Import a part of them")
+    for name in ("orientations", "orientationsf", "scales"):
+        given = prim.GetAttribute(name).Get(time) if prim.GetAttribute(name) else None
+        if given is not None and len(given) not in (0, len(indices)):
+            raise Refused(f"{where} {len(given)} {name} for {len(indices)} instances", _HINT)
     kind = UsdGeom.PointInstancer
     transforms = instancer.ComputeInstanceTransformsAtTime(time, time, kind.IncludeProtoXform, kind.IgnoreMask)
-    if len(transforms) != len(indices):
-        raise Refused(f"{where} orientations or scales do not fit its {len(indices)} instances", _HINT)
     mask = list(instancer.ComputeMaskAtTime(time)) or [True] * len(indices)
     prim.SetTypeName("Xform")
     count = 0

@@ -7,6 +7,7 @@ from typing import Any
 from ..openusd import Prim, Stage, Value, pxr
 from .answer import Arrays, prims_of
 from .instancers import expand
+from .unread import other_units, unread
 
 _ARRAYS = ("positions", "orientations", "scales", "opacities", "radiance:sphericalHarmonicsCoefficients")
 
@@ -34,11 +35,13 @@ def read(stage: Stage, request: dict[str, Any], arrays: Arrays) -> dict[str, Any
         found, count = read_prim(prim, time, arrays, request["most"] - total)
         total += count
         prims.append({**found, "matrix": flat(transforms.GetLocalToWorldTransform(prim))})
+    everything = list(prims_of(stage))
     return {
         "up": str(UsdGeom.GetStageUpAxis(stage)),
         "meters": UsdGeom.GetStageMetersPerUnit(stage),
         "prims": prims,
-        "notes": copies,
+        "warnings": other_units(stage, everything),
+        "notes": [*copies, *unread(everything, [prim["path"] for prim in prims])],
     }
 
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -81,7 +82,9 @@ def _read_stage(file: Path, time_code: float | None) -> Splats:
     if not (np.isfinite(meters) and meters > 0.0):
         raise unreadable(file, f"metersPerUnit is {meters}", hint="Set it to the length of the unit in m")
     found = joined(parts, f"splat file {file}").transformed(rotation=up, scale=meters)
-    return replace(found, notes=(*found.notes, *stage["notes"]))
+    for text in stage["warnings"]:
+        warnings.warn(f"splat file {file}: {text}", stacklevel=4)
+    return replace(found, notes=(*found.notes, *stage["warnings"], *stage["notes"]))
 
 
 def splats_from_prim(prim: dict[str, Any], sent: list[NDArray[Any]], name: str) -> Splats:
