@@ -189,6 +189,7 @@ def scene_from_answer(answer: process.Answer, name: str) -> UsdScene:
     with process.invalid_data(name):
         bodies = tuple(_deformable(body, answer.arrays, frame, name) for body in stage["bodies"])
         scenery = [_splats(prim, answer.arrays, frame, np.eye(4), name) for prim in stage["scenery"]]
+    notes += [f"{part.name.removeprefix(f'{name}: ')}: {note}" for part in scenery for note in part.notes]
     return UsdScene(
         file=name.removeprefix("OpenUSD file "),
         deformables=bodies,
@@ -282,6 +283,7 @@ def _deformable(body: dict[str, Any], arrays: list[NDArray[Any]], frame: StageFr
         size = abs(float(np.linalg.det(stretch))) ** (1.0 / 3.0)
         radii = np.broadcast_to(0.5 * size * widths.reshape(-1), (len(points),)).copy()
     pictures = [_splats(prim, arrays, frame, to_asset, name) for prim in body["splats"]]
+    notes += [f"{part.name.removeprefix(f'{name}: ')}: {note}" for part in pictures for note in part.notes]
     meshes = []
     for mesh in body["meshes"]:
         relative = _snapped(to_asset @ frame.matrix(mesh["matrix"]))

@@ -124,6 +124,8 @@ def _text_points(file: Path, name: str) -> _Cloud:
         extra = extra[:, 1:]
     if extra.shape[1] >= 3:
         colors, extra = extra[:, :3], extra[:, 3:]
+        if colors.max() > 1.0 and (colors == np.round(colors)).all():  # bytes, written as text
+            colors = colors.astype(np.int64)
     if extra.shape[1]:
         notes.append(f"{extra.shape[1]} more numbers in each line are not read")
     return _Cloud(table[:, :3], normals, colors, notes)

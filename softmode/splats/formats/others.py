@@ -15,7 +15,7 @@ OTHERS: dict[str, tuple[str, str]] = {
     ".ksplat": ("splats of mkkellogg's viewer", _TRANSFORM),
     ".lcc": ("splats of XGRIDS", _TRANSFORM),
     **dict.fromkeys((".ckpt", ".pt", ".pth"), ("a checkpoint of a training", _NERFSTUDIO)),
-    **dict.fromkeys((".yml", ".yaml"), ("a configuration, as nerfstudio writes it", _NERFSTUDIO)),
+    **dict.fromkeys((".yml", ".yaml"), ("a configuration of nerfstudio", _NERFSTUDIO.replace("CONFIG.yml", "{file}"))),
     ".npy": (
         "an array without a name",
         "python -c \"import numpy as np; np.savez('{stem}.npz', points=np.load('{file}')[:, :3])\"",
