@@ -103,8 +103,8 @@ class TaskConfig:
         for thing in (self.scene.object, *self.scene.others):
             hint = "a table and its gripper take 5 mm to 1 m; larger and smaller bodies are for scenes of your own"
             if thing.longest_edge is not None:
-                limits = {"at_least": _SIZES[0], "at_most": _SIZES[1]}
-                require_number("size of an object", thing.longest_edge, **limits, unit="m", hint=hint)
+                low, high = _SIZES
+                require_number("an object's size", thing.longest_edge, at_least=low, at_most=high, unit="m", hint=hint)
 
     @property
     def object_set(self) -> ObjectSet | None:

@@ -107,7 +107,8 @@ def _cached_splats(key: tuple[object, ...], name: str, make: Callable[[], Splats
     fields = ("means", "quats", "scales", "opacities", "sh")
 
     def read(path: Path) -> Splats:
-        return Splats(**read_archive(path, "softmode.baked", 1)[1], name=name)
+        arrays: dict[str, Any] = read_archive(path, "softmode.baked", 1)[1]
+        return Splats(**arrays, name=name)
 
     def write(splats: Splats, path: Path) -> None:
         write_archive(
@@ -173,8 +174,8 @@ def _splat_source(config: ObjectConfig, given: str | Path | Splats | None) -> Ob
     arrays = (splats.means, splats.scales, splats.quats, splats.opacities)
     solid = partial(quadrature_from_splats, *arrays, surface_count=config.surface_count, resolution=config.resolution)
     key = ("splats", *arrays, config.resolution)
-    given = int(capture["asset_splats"])
-    return ObjectSource(splats, solid, name, key, given, config.longest_edge, None, capture, told.offset, told.notes)
+    count = int(capture["asset_splats"])
+    return ObjectSource(splats, solid, name, key, count, config.longest_edge, None, capture, told.offset, told.notes)
 
 
 def _body_source(config: ObjectConfig, given: str | Path) -> ObjectSource:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -311,7 +311,7 @@ def joined(parts: list[Splats], name: str) -> Splats:
     if len(parts) == 1:
         return parts[0]
     columns = ("quats", "scales", "opacities")
-    joint = {column: np.concatenate([getattr(part, column) for part in parts]) for column in columns}
+    joint: dict[str, Any] = {column: np.concatenate([getattr(part, column) for part in parts]) for column in columns}
     offset = parts[0].offset
     means = [part.means + np.subtract(part.offset, offset) if part.offset != offset else part.means for part in parts]
     notes = tuple(dict.fromkeys(note for part in parts for note in part.notes))

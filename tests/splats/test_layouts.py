@@ -44,7 +44,7 @@ def ply_of(
     order = "=" if form == "ascii" else form
     lines = ["ply", f"format {FORMS[form]} 1.0", "comment by hand", *before.decode().splitlines()]
     lines += [f"element vertex {len(table)}"]
-    lines += [f"property {NAMES[table.dtype[name].str[1:]]} {name}" for name in table.dtype.names]
+    lines += [f"property {NAMES[table.dtype[name].str[1:]]} {name}" for name in table.dtype.names or ()]
     lines += ["property list uchar int near"] * lists + after.decode().splitlines()
     head = "\n".join([*lines, "end_header\n"]).encode()
     if form == "ascii":

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..openusd import Prim, Stage, pxr
+from ..openusd import Prim, Stage, Value, pxr
 from .limits import MAX_DEPTH, Refused
 
 MAX_COPIES = 4096
@@ -64,7 +64,7 @@ def expand(stage: Stage) -> list[str]:
     return notes
 
 
-def _copy(prim: Prim, targets: list[object], time: object, before: int) -> int:
+def _copy(prim: Prim, targets: list[Value], time: Value, before: int) -> int:
     """Replace an instancer by its copies; return their number."""
     (UsdGeom,) = pxr("UsdGeom")
     stage, instancer = prim.GetStage(), UsdGeom.PointInstancer(prim)

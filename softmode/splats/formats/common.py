@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -93,7 +93,7 @@ def offset_note(offset: Sequence[float]) -> list[str]:
     return ["coordinates are counted from ({:g}, {:g}, {:g}) on, the offset".format(*offset)] if any(offset) else []
 
 
-def count_dropped(name: str, good: dict[str, NDArray[np.bool_]], what: str = "splats") -> list[str]:
+def count_dropped(name: str, good: Mapping[str, Any], what: str = "splats") -> list[str]:
     """Return a note on rows that are dropped; a warning says it too if there are many, an error if none is left.
 
     Args:
