@@ -6,7 +6,7 @@ import os
 import re
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -44,6 +44,10 @@ class Element:
     def dtype(self) -> np.dtype[Any]:
         """The columns, without lists."""
         return np.dtype([(name, kind) for name, kind in self.properties if name not in self.lists])
+
+    def in_doubles(self) -> Element:
+        """Return this with doubles in place of all types, as text is read."""
+        return replace(self, properties=[(n, "f8") for n, _ in self.properties], lists=dict.fromkeys(self.lists, "f8"))
 
 
 @dataclass(frozen=True)
@@ -136,114 +140,59 @@ def read_tables(file: BinaryIO, header: Header, wanted: Sequence[str], path: Pat
             counts = ", ".join(f"{element.count} {element.name}" for element in list(elements.values())[:8])
             raise unreadable(path, f"header declares {counts} and {declared} bytes, the file holds {size}")
     file.seek(header.offset)
+    data, at, text = read_exactly(file, size - header.offset, path), 0, header.form == "ascii"
+    if text:
+        data = _numbers(data, path).tobytes()
     left = [name for name in elements if name in wanted]
     tables: dict[str, NDArray[Any]] = {}
-    rows: _Binary | _Text | None = None
     for element in elements.values():
-        if not left:
-            break
-        # Plain tables are read straight from the file; from the first list on, or of text, all of it is in memory.
-        if rows is None and (element.lists or header.form == "ascii"):
-            data = read_exactly(file, size - file.tell(), path)
-            rows = _Text(data, path) if header.form == "ascii" else _Binary(data, path)
-        if rows is None:
-            data = read_exactly(file, element.count * element.dtype.itemsize, path)
-            table = np.frombuffer(data, dtype=element.dtype)
-        else:
-            table = rows.take(element)
-        if element.name in left:
-            left.remove(element.name)
-            tables[element.name] = table.astype(table.dtype.newbyteorder("="), copy=False)
+        if left:
+            table, at = _take(data, at, element.in_doubles() if text else element, path)
+            if element.name in left:
+                left.remove(element.name)
+                with np.errstate(over="ignore", invalid="ignore"):
+                    tables[element.name] = table.astype(element.dtype.newbyteorder("="), copy=False)
     return tables
 
 
-class _Binary:
-    """Takes tables off bytes."""
-
-    def __init__(self, data: bytes, path: Path) -> None:
-        self.data, self.path, self.at = data, path, 0
-
-    def take(self, element: Element) -> NDArray[Any]:
-        """Return the next table."""
-        if not element.lists:
-            size = element.count * element.dtype.itemsize
-            self._need(size, element)
-            self.at += size
-            return np.frombuffer(self.data, element.dtype, element.count, self.at - size)
-        steps = [(np.dtype(kind), element.lists.get(name)) for name, kind in element.properties]
-        self._need(sum(np.dtype(counts or kind).itemsize for kind, counts in steps) * element.count, element)
-        starts = np.empty((element.count, len(steps)), np.int64)
-        at = self.at
-        for row in range(element.count):
-            for column, (kind, counts) in enumerate(steps):
-                starts[row, column] = at
-                at += kind.itemsize if counts is None else self._list(at, np.dtype(counts), kind.itemsize, element)
-        self.at = at
-        self._need(0, element)
-        table = np.empty(element.count, element.dtype)
-        octets = np.frombuffer(self.data, np.uint8)
-        for column, (name, kind) in enumerate(element.properties):
-            if name not in element.lists:
-                index = starts[:, column, None] + np.arange(np.dtype(kind).itemsize)
-                table[name] = octets[index].view(kind)[:, 0]
-        return table
-
-    def _list(self, at: int, counts: np.dtype[Any], size: int, element: Element) -> int:
-        """Return the bytes of a list."""
-        if at + counts.itemsize > len(self.data):
-            self._short(element)
-        return counts.itemsize + size * _entries(np.frombuffer(self.data, counts, 1, at)[0], self.path)
-
-    def _need(self, size: int, element: Element) -> None:
-        if self.at + size > len(self.data):
-            self._short(element)
-
-    def _short(self, element: Element) -> None:
-        raise unreadable(self.path, f"header declares {element.count} {element.name}, the file holds fewer")
+def _numbers(data: bytes, path: Path) -> NDArray[np.float64]:
+    """Return all numbers of a text."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", DeprecationWarning)  # what older NumPy does about text that is no number
+            return np.fromstring(data.decode("ascii", "replace"), sep=" ")
+    except (ValueError, DeprecationWarning) as error:
+        raise unreadable(path, "holds text that is no number") from error
 
 
-class _Text:
-    """Takes tables off numbers written as text."""
-
-    def __init__(self, data: bytes, path: Path) -> None:
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("error", DeprecationWarning)  # what older NumPy does about text that is no number
-                self.values = np.fromstring(data.decode("ascii", "replace"), sep=" ")
-        except (ValueError, DeprecationWarning) as error:
-            raise unreadable(path, "holds text that is no number") from error
-        self.path, self.at = path, 0
-
-    def take(self, element: Element) -> NDArray[Any]:
-        """Return the next table."""
-        width = len(element.properties)
-        if len(self.values) - self.at < width * element.count:
-            raise unreadable(self.path, f"header declares {element.count} {element.name}, the file holds fewer numbers")
-        where = self.at + np.arange(width) + width * np.arange(element.count)[:, None]
-        if element.lists:
-            where, at = np.empty((element.count, width), np.int64), self.at
-            for row in range(element.count):
-                for column, (name, _) in enumerate(element.properties):
-                    where[row, column] = at
-                    if at >= len(self.values):
-                        raise unreadable(self.path, f"ends within {element.name} {row} of {element.count}")
-                    at += 1 + (_entries(self.values[at], self.path) if name in element.lists else 0)
-            self.at = at
-        else:
-            self.at += width * element.count
-        table = np.empty(element.count, element.dtype)
-        with np.errstate(over="ignore", invalid="ignore"):
-            for column, (name, _) in enumerate(element.properties):
-                if name not in element.lists:
-                    table[name] = self.values[where[:, column]]
-        return table
-
-
-def _entries(count: Any, path: Path) -> int:
-    """Return the number of entries of a list."""
-    if not 0 <= count <= 2**31:
-        raise unreadable(path, f"a list of {count} entries")
-    return int(count)
+def _take(data: bytes, at: int, element: Element, path: Path) -> tuple[NDArray[Any], int]:
+    """Return the table of an element that begins at some byte, without its lists, and where it ends."""
+    short = unreadable(path, f"header declares {element.count} {element.name}, the file holds fewer")
+    steps = [(np.dtype(kind), np.dtype(element.lists.get(name, kind))) for name, kind in element.properties]
+    if at + element.count * sum(first.itemsize for _, first in steps) > len(data):
+        raise short
+    if not element.lists:
+        return np.frombuffer(data, element.dtype, element.count, at), at + element.count * element.dtype.itemsize
+    starts = np.empty((element.count, len(steps)), np.int64)
+    is_list = [name in element.lists for name, _ in element.properties]
+    for row in range(element.count):
+        for column, (kind, first) in enumerate(steps):
+            starts[row, column] = at
+            at += first.itemsize
+            if at > len(data):
+                raise short
+            if is_list[column]:
+                entries = np.frombuffer(data, first, 1, at - first.itemsize)[0]
+                if not 0 <= entries <= len(data):
+                    raise unreadable(path, f"a list of {entries} entries")
+                at += int(entries) * kind.itemsize
+    if at > len(data):
+        raise short
+    table, octets = np.empty(element.count, element.dtype), np.frombuffer(data, np.uint8)
+    for column, (name, kind) in enumerate(element.properties):
+        if not is_list[column]:
+            table[name] = octets[starts[:, column, None] + np.arange(steps[column][0].itemsize)].view(kind)[:, 0]
+    return table, at
 
 
 def check_rows(header: Header, name: str, path: Path) -> Element:
