@@ -168,6 +168,7 @@ def splats_from_points(
     colors = None if colors is None else np.asarray(colors)
     with np.errstate(invalid="ignore"):
         good = (np.abs(x) < _FAR).all(axis=1)
+        good &= True if normals is None else (np.abs(normals) < _FAR).all(axis=1)
     if len(x) and not good.all():
         told += count_dropped(name, {"not finite": good}, "points")
         colors = colors if colors is None or len(colors) != len(x) else colors[good]
@@ -214,7 +215,6 @@ def splats_from_points(
 
 def _frames(normals: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return orthogonal frames (N, 3, 3) whose last column is the normal."""
-    normals = np.nan_to_num(normals, posinf=0.0, neginf=0.0)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     return frames_of(np.where(length > 1e-12, normals / np.maximum(length, 1e-12), [0.0, 0.0, 1.0]))
 
