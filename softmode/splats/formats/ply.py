@@ -43,9 +43,10 @@ _FAMILIES = ("f_dc_", "f_rest_", "scale_", "rot_")
 def read_ply(path: str | os.PathLike[str]) -> Splats:
     """Read an INRIA `.ply` (log scales, logit opacities, quaternions wxyz) or a PlayCanvas `.compressed.ply`.
 
-    Text and both byte orders are read. What has scales and rotations is splats; colours are those of degree 0, else red,
-    green and blue, as integers or floats. Discs with two scales (2D Gaussian splatting) get a third one, a thousandth of the
-    smaller; the filter of Mip-Splatting, `filter_3D`, is applied. Other elements and properties are left out.
+    Text and both byte orders are read. What has scales and rotations is splats; colours are those of degree 0, else
+    red, green and blue, as integers or floats. Discs with two scales (2D Gaussian splatting) get a third one, a
+    thousandth of the smaller; the filter of Mip-Splatting, `filter_3D`, is applied. Other elements and properties are
+    left out.
 
     Raises:
         AssetError: If the file is no splat `.ply`, contradicts its header, or holds no usable splats.
