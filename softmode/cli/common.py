@@ -88,7 +88,7 @@ def finding_line(finding: Finding, stream: TextIO) -> str:
     severity = finding.severity
     if stream.isatty() and not os.environ.get("NO_COLOR"):
         severity = f"\x1b[{'31' if severity == 'broken' else '33'}m{severity}\x1b[0m"
-    return f"{severity}: {finding.name}: {finding.what}. {remedy}."
+    return f"{severity}: {finding.name}: {finding.what}." + (f" {remedy}." if remedy else "")
 
 
 def warn_of_env(env: Any) -> None:

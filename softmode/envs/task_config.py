@@ -27,6 +27,9 @@ _RANGES: dict[str, dict[str, float]] = {
 }
 """Limits of the ranges that may be None."""
 
+_SIZES = (0.005, 1.0)
+"""Least and largest longest edge of a file's object on a table [m]."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class TaskConfig:
@@ -106,6 +109,11 @@ class TaskConfig:
         require_number("image_size", self.image_size, at_least=36, at_most=640, unit="px")
         require_number("render_size", self.render_size, at_least=64, at_most=1024, unit="px")
         require_choice("mesh_samples", self.mesh_samples, (1, 4))
+        for thing in (self.scene.object, *self.scene.others):
+            hint = "a table and its gripper take 5 mm to 1 m; larger and smaller bodies are for scenes of your own"
+            if thing.longest_edge is not None:
+                low, high = _SIZES
+                require_number("an object's size", thing.longest_edge, at_least=low, at_most=high, unit="m", hint=hint)
 
     @property
     def object_set(self) -> ObjectSet | None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.build.cache import cached_body
-from softmode.deformables.materials.material import Material
+from softmode.deformables.materials.material import Material, warn_of_units
 from softmode.objects.config import ObjectConfig
 from softmode.objects.object_file import file_kind, read_object, surface_cover
 from softmode.objects.pipeline import body_key, build_standing, dressed
@@ -57,6 +57,8 @@ def load(
         ConfigError: If an option is out of range.
         TypeError: If the source is none of these, or there is no such option.
     """
+    if material is not None:
+        warn_of_units(material, "material")
     if isinstance(source, ReducedBody):
         return SoftObject(body=source, splats=surface_cover(source), material=material, **options)
     config = object_config(source, **options)

@@ -21,6 +21,7 @@ from softmode.objects.soft_object import SoftObject
 from softmode.radiance.formats import is_radiance
 from softmode.radiance.grid import RadianceGrid
 from softmode.splats.formats import READABLE
+from softmode.splats.formats.others import refuse_others
 from softmode.splats.point_cloud import ply_kind, splats_from_points
 from softmode.splats.splats import Splats
 
@@ -105,6 +106,7 @@ def file_kind(path: str | os.PathLike[str]) -> FileKind:
     suffix = file.suffix.lower()
     if is_radiance(file):
         return "radiance"
+    refuse_others(file)
     if suffix == ".npz":
         names = array_names(file, hint="build or write it again")
         return "points" if "points" in names and "header" not in names else "body"

@@ -76,7 +76,8 @@ class SoftObject:
             jaw: The gripper that is to take it from where it stands, see `plan_grasps`; None where none is to.
         """
         splats = None if self.splats is None else self.splats.means
-        found = object_findings(self.body, splats=splats, size=self.size_asked)
+        found = tuple(Finding(severity="note", name="file", what=note, remedy="") for note in self.notes)
+        found += object_findings(self.body, splats=splats, size=self.size_asked)
         if jaw is None:
             return found
         friction = math.sqrt((self.material or Material()).friction * jaw.friction)

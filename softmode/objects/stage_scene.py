@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -168,9 +169,11 @@ def open_scene(
     )
     stage = answer.described
     frame = stage_frame(stage, name)
+    notes = [*warned(stage["warnings"], name), *stage["notes"]]
     with damage_errors(name):
         bodies = tuple(_deformable(body, answer.arrays, frame, name) for body in stage["bodies"])
         scenery = [_splats(prim, answer.arrays, frame, np.eye(4), name) for prim in stage["scenery"]]
+    notes += [f"{part.name.removeprefix(f'{name}: ')}: {note}" for part in scenery for note in part.notes]
     return UsdScene(
         file=str(path),
         deformables=bodies,
@@ -178,8 +181,15 @@ def open_scene(
         kilograms_per_unit=frame.kilograms,
         up_axis=stage["up"],
         scenery=joined(scenery, name) if scenery else None,
-        notes=tuple(stage["notes"]),
+        notes=tuple(notes),
     )
+
+
+def warned(texts: list[str], name: str) -> list[str]:
+    """Return what a stage is to be warned of, having warned of it."""
+    for text in texts:
+        warnings.warn(f"{name}: {text}", stacklevel=4)
+    return texts
 
 
 @dataclass(frozen=True)
@@ -257,12 +267,15 @@ def _deformable(body: dict[str, Any], arrays: list[NDArray[Any]], frame: StageFr
         size = abs(float(np.linalg.det(stretch))) ** (1.0 / 3.0)
         radii = np.broadcast_to(0.5 * size * widths.reshape(-1), (len(points),)).copy()
     pictures = [_splats(prim, arrays, frame, to_asset, name) for prim in body["splats"]]
+    notes += [f"{part.name.removeprefix(f'{name}: ')}: {note}" for part in pictures for note in part.notes]
     meshes = []
     for mesh in body["meshes"]:
         relative = _snapped(to_asset @ frame.matrix(mesh["matrix"]))
         meshes.append(
             mesh_surface(parts_of(mesh, arrays, frame), relative[:3, :3], f"{name}: {mesh['path']}", relative[:3, 3])
         )
+    for mesh in (*meshes, *((surface,) if surface is not None and not meshes and not pictures else ())):
+        notes += mesh.notes
     properties, sources = _properties(body, own)
     mass = body["mass"]
     if mass is None and "masses" in shape:
@@ -294,7 +307,7 @@ def _splats(prim: dict[str, Any], arrays: list[NDArray[Any]], frame: StageFrame,
     if frame.meters != 1.0 or not np.array_equal(frame.up, np.eye(3)):
         part = part.transformed(rotation=frame.up, scale=frame.meters)
     relative = _snapped(into @ frame.matrix(prim["matrix"]))
-    return part if np.array_equal(relative, np.eye(4)) else placed(part, relative)
+    return part if np.array_equal(relative, np.eye(4)) and not any(part.offset) else placed(part, relative)
 
 
 def _snapped(matrix: Array) -> Array:
@@ -312,7 +325,20 @@ def parts_of(shape: dict[str, Any], arrays: list[NDArray[Any]], frame: StageFram
     found["points"] = frame.points(points)
     if "widths" in found:
         found["widths"] = frame.meters * found["widths"].astype(np.float64)
-    return {**found, "left_handed": shape["left_handed"]}
+    if "look" in shape:
+        found["look"] = _resolved(shape["look"], arrays)
+    return {**found, "path": shape["path"], "left_handed": shape["left_handed"]}
+
+
+def _resolved(look: dict[str, Any], arrays: list[NDArray[Any]]) -> dict[str, Any]:
+    """Return how a geometry looks, its arrays in place of their numbers."""
+
+    def of(given: Any) -> Any:
+        if isinstance(given, dict):
+            return {key: arrays[value] if type(value) is int else of(value) for key, value in given.items()}
+        return [of(one) if isinstance(one, dict) else one for one in given] if isinstance(given, list) else given
+
+    return of(look)
 
 
 def _properties(body: dict[str, Any], frame: StageFrame) -> tuple[dict[str, float], dict[str, str]]:

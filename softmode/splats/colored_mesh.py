@@ -37,6 +37,10 @@ class ColoredMesh:
     """Images, first row at v = 1, each of shape (height, width, 3)."""
     name: str = "mesh"
     """Where the mesh comes from; used in messages."""
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """What the corners lack to the file's own coordinates [m], where these are too far out for float32."""
+    notes: tuple[str, ...] = ()
+    """What was read from the file in another way than it was meant."""
 
     def __post_init__(self) -> None:
         """Refuse what has no surface."""

@@ -75,7 +75,7 @@ def test_crates_that_declare_huge_arrays(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_points_that_are_no_numbers(tmp_path: Path, kind: str) -> None:
-    """NaN among the positions is refused, with the prim that has it."""
+    """NaN among the positions is refused, with the prim that has it; a splat is dropped, and the notes say so."""
     author = Author.create(tmp_path / "a.usda")
     author.body("/World/Toy", kind)
     author.stage.GetPrimAtPath("/World/Toy/Geometry")
@@ -85,6 +85,11 @@ def test_points_that_are_no_numbers(tmp_path: Path, kind: str) -> None:
     values[1] = np.nan
     attribute.Set(values)
     author.save()
+    if kind == "ParticleField3DGaussianSplat":
+        (body,) = read_usd_scene(tmp_path / "a.usda").deformables
+        assert body.splats is not None and body.splats.count == len(values) - 1
+        assert body.notes[0].startswith(f"/World/Toy/Geometry: 1 of {len(values)} splats dropped")
+        return
     with pytest.raises(AssetError, match="/World/Toy/Geometry"):
         read_usd_scene(tmp_path / "a.usda")
 
