@@ -1,7 +1,7 @@
 """How far each phase of a step in a grasp is from the arithmetic, the traffic and the launches that it needs.
 
 Run: ``python -m benchmarks.roofline [--device cuda:0 --worlds 4096] [--preset beam]``. The table of
-``docs/performance.md`` is its output.
+``benchmarks/JOURNAL.md`` is its output.
 
 The object is held as in ``benchmarks/grasp_phases.py``. Each phase of Newton's iteration is launched by itself, in one
 eager control step, and timed; its flops and bytes per world follow from the sizes of the body, listed in `work`. The

@@ -2,7 +2,7 @@
 
 Run: ``python -m benchmarks.freeform [--tables 1 2 3 4 5] [--figures 4 7] [--quick] [--output out/freeform.json]``.
 What is run replaces its part of the output; Table 2 goes on where it was left.
-`docs/freeform_tables.md` says what the rows mean. SPH is not run.
+`benchmarks/freeform/TABLES.md` says what the rows mean. SPH is not run.
 """
 
 from __future__ import annotations
