@@ -109,7 +109,7 @@ smoke: dist  ## install the wheel alone into a new environment, make an environm
 bench: $(VENV)/.demo  ## time the build, a step and each stage of a grasp
 	$(BIN)/python benchmarks/build.py
 	$(BIN)/python benchmarks/step.py --stages $(ARGS)
-	$(BIN)/python benchmarks/grasp.py
+	$(BIN)/python -m benchmarks.grasp_phases
 
 $(VENV)/.bench: $(VENV)/.dev
 	$(INSTALL) --editable '.[bench]' || $(BIN)/python -m pip install --quiet -c constraints.txt --editable '.[bench]'
