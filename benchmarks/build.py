@@ -16,6 +16,7 @@ import time
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from benchmarks.record import add_record_option, record
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.body.regions import Region
 from softmode.deformables.build.build_body import build_body
@@ -44,7 +45,10 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repeats", type=int, default=7)
-    repeats = parser.parse_args().repeats
+    add_record_option(parser)
+    given = parser.parse_args()
+    repeats = given.repeats
+    found: dict[str, float | str] = {}
     with threadpool_limits(limits=1):
         quadrature = quadrature_from_box((5.0, 1.0, 1.0), point_count=5000)
         print(f"{len(quadrature.points)} quadrature points, one core, medians of {repeats} builds [s]")
@@ -52,11 +56,15 @@ def main() -> None:
             f"{'':<38}" + "".join(f"{name:>11}" for name in (*BASIS, "basis", "cubature", "all", "cpu")) + "  functions"
         )
         for name, (options, regions) in CASES.items():
-            report(name, quadrature, options, regions, repeats)
+            found[name] = report(name, quadrature, options, regions, repeats)
+    if given.record:
+        record("build", {"box": found["default: 48 functions, K = 1000"]})
 
 
-def report(name: str, quadrature: Quadrature, options: BuildOptions, regions: tuple[Region, ...], repeats: int) -> None:
-    """Build `repeats` times and print the medians."""
+def report(
+    name: str, quadrature: Quadrature, options: BuildOptions, regions: tuple[Region, ...], repeats: int
+) -> float:
+    """Build `repeats` times, print the medians, and return that of the processor time [s]."""
     bodies, processor = [], []
     for _ in range(repeats):
         clock = time.process_time()
@@ -68,6 +76,7 @@ def report(name: str, quadrature: Quadrature, options: BuildOptions, regions: tu
     whole = statistics.median(body.build_seconds for body in bodies)
     row = "".join(f"{value:11.3f}" for value in (*stages, basis, cubature, whole, statistics.median(processor)))
     print(f"{name:<38}{row}  {bodies[0].function_count} ({bodies[0].driven_count} driven)", flush=True)
+    return statistics.median(processor)
 
 
 def seconds(body: ReducedBody, stage: str) -> float:

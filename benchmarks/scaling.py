@@ -29,6 +29,7 @@ import warp as wp
 
 from benchmarks.clock import held
 from benchmarks.pile import pile
+from benchmarks.record import add_record_option, record
 from softmode.envs.catalogue import config_class
 from softmode.envs.reward_kernels import TOUCH_FORCE
 from softmode.envs.throughput import Actions, _Source
@@ -55,6 +56,7 @@ def main() -> None:
     parser.add_argument("--worlds", type=int, default=None, help="worlds of the other axes; default 1, on CUDA 1024")
     parser.add_argument("--values", type=int, nargs="+", default=None, help="values of the axis, if it is one")
     add_object_options(parser)
+    add_record_option(parser)
     parser.add_argument("--actions", nargs="+", choices=("random", "grasp"), default=["random", "grasp"])
     parser.add_argument("--steps", type=int, default=60)
     parser.add_argument("--warmup", type=int, default=60, help="control steps before the clock starts")
@@ -190,11 +192,15 @@ def row(worlds: int, config: Any, device: wp.Device, options: argparse.Namespace
     before = held(device)
     env = make(worlds, config, device)
     rates, touching = dict.fromkeys(("random", "grasp"), ""), ""
+    measured: dict[str, float | str] = {}
     for actions in options.actions:
         found, share_touching = rate(env, actions, device, options)
         rates[actions] = f"{found:,.0f}"
+        measured[f"{options.preset or 'plush'}_{actions}_{worlds}"] = round(found)
         if actions == "grasp":
             touching = f"{100 * share_touching:.0f} %"
+    if options.record and options.axes == ["worlds"]:
+        record("scaling", measured, str(device))
     memory = (held(device) - before) / worlds
     tables = env.task.scene.solver.reduced.tables
     iterations, contacts = (array.numpy().mean() for array in (tables.newton.iteration, tables.constraints.count))
