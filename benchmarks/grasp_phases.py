@@ -1,6 +1,6 @@
 """Where a control step goes while the fingers hold the object: rate, Newton iterations, contacts, time per kernel.
 
-Run: ``python -m benchmarks.grasp_phases --device cuda:0`` or, on one core, without ``--device``. Two
+Run: ``python benchmarks/grasp_phases.py --device cuda:0`` or, on one core, ``python benchmarks/grasp_phases.py``. Two
 versions of softmode compare with the same script: ``PYTHONPATH=<the other tree> python benchmarks/grasp_phases.py``.
 
 Protocol of ``softmode bench --actions grasp``: LiftSoft with states, 4 steps of 1/120 s per control step;
@@ -17,6 +17,7 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -24,9 +25,12 @@ import numpy as np
 import warp as wp
 
 import softmode
-from benchmarks.scaling import ENVIRONMENT, task_configuration
+from softmode.envs.catalogue import config_class
 from softmode.envs.reward_kernels import TOUCH_FORCE
 from softmode.envs.throughput import _Source
+
+ENVIRONMENT = "softmode/LiftSoft-v0"
+SUBSTEPS = 4
 
 
 def main() -> None:
@@ -52,7 +56,11 @@ def main() -> None:
 
 def report(preset: str, count: int, device: wp.Device, options: argparse.Namespace) -> None:
     """Make an environment, hold the object, print what a step costs."""
-    config = task_configuration(argparse.Namespace(**{**vars(options), "preset": preset}))
+    known = config_class(ENVIRONMENT)
+    config = known() if preset == "plush" else known.preset(preset)
+    ratios = None if options.poissons_ratio is None else tuple(options.poissons_ratio)
+    scene = replace(config.scene, control_hz=30.0, substeps=SUBSTEPS)
+    config = replace(config, scene=scene, poissons_ratio_range=ratios)
     given = {"config": config, "obs_type": "state", "output": "torch" if device.is_cuda else "numpy"}
     clock = time.perf_counter()
     env: Any = gym.make_vec(ENVIRONMENT, num_envs=count, device=options.device, **given)

@@ -1,6 +1,6 @@
 """Write the page "Figures" from ``docs/data/*.json``, and fill in the marked places of README and pages.
 
-Run: ``python docs/figures.py``. A place is marked by two comments: ``<!-- figure FILE.NAME -->VALUE<!-- end -->``. What
+Run: ``python docs/figures.py``. A place is marked by two comments: ``<!-- =FILE.NAME -->VALUE<!-- / -->``. What
 stands between them is the figure's value with its unit. `benchmarks.record` writes the values.
 """
 
@@ -13,7 +13,7 @@ from typing import Any
 
 DOCS = Path(__file__).resolve().parent
 PAGE = DOCS / "figures.md"
-MARKED = re.compile(r"<!-- figure (?P<name>[\w.]+) -->(?P<value>[^<]*)<!-- end -->")
+MARKED = re.compile(r"<!-- =(?P<name>[\w.]+) -->(?P<value>[^<]*)<!-- / -->")
 PREAMBLE = """# Figures
 
 These are the headline figures of speed and of what belongs to it. Each has the date of its measurement, the machine,
@@ -52,7 +52,7 @@ def filled(text: str, known: dict[str, dict[str, Any]]) -> str:
     Raises:
         KeyError: A place names a figure that ``docs/data`` does not have.
     """
-    return MARKED.sub(lambda match: f"<!-- figure {match['name']} -->{written(known[match['name']])}<!-- end -->", text)
+    return MARKED.sub(lambda match: f"<!-- ={match['name']} -->{written(known[match['name']])}<!-- / -->", text)
 
 
 def page(known: dict[str, dict[str, Any]]) -> str:
