@@ -1,10 +1,10 @@
 """Time the build of a body, stage by stage, on one core.
 
-Run: ``python -m benchmarks.build [--repeats N] [--record]``. Medians over builds of the plush from its splats, the
-default, of the papers' beam (5 x 1 x 1 m) with 5,000 points, 1,000 kernels and 32 modes, of the default body, and of a beam held and driven at its ends. The basis (kernels,
-eigenmodes, responses, functions) and the cubature are told apart; the target for the first basis is 0.5 s. For scale:
-FreeForm builds 32 modes in 3.19-3.93 s on a GPU. On a busy machine compare `all` with `cpu`, the processor time of the
-whole build: stages are stretched by the same factor.
+Run: ``python -m benchmarks.build [--repeats N] [--record]``. Medians over builds of the papers' beam (5 x 1 x 1 m) with
+5,000 points, 1,000 kernels and 32 modes, of the default body, and of a beam held and driven at its ends; then of the
+plush from its splats. The basis (kernels, eigenmodes, responses, functions) and the cubature are told apart; the target
+for the first basis is 0.5 s. For scale: FreeForm builds 32 modes in 3.19-3.93 s on a GPU. On a busy machine compare
+`all` with `cpu`, the processor time of the whole build: stages are stretched by the same factor.
 """
 
 from __future__ import annotations
