@@ -50,7 +50,8 @@ def record(benchmark: str, values: dict[str, float | str], device: str = "cpu", 
     }
     for name, value in values.items():
         if name in figures:
-            figures[name] |= {"value": value, **told}
+            exact = value if isinstance(value, str) or abs(value) >= 1000 else float(f"{value:.3g}")
+            figures[name] |= {"value": exact, **told}
     path.write_text(json.dumps(figures, indent=1) + "\n")
 
 
