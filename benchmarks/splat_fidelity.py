@@ -27,14 +27,14 @@ from PIL import Image
 from scipy.ndimage import binary_dilation
 
 from softmode.deformables.body.reduced_body import ReducedBody
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_box
+from softmode.deformables.quadrature.quadrature import quadrature_from_box
+from softmode.deformables.reduction.build_body import build_body
+from softmode.deformables.reduction.options import BuildOptions
 from softmode.deformables.skinning.skin_splats import STRETCH_LIMIT, SkinSplats, average_basis
 from softmode.objects import ObjectConfig, load
 from softmode.splats import Splats
-from softmode.splats.pinhole import PinholeCamera
-from softmode.splats.rasterizer import RasterizerOptions, SplatArrays, SplatRasterizer, ViewArrays
+from softmode.splats.raster.pinhole import PinholeCamera
+from softmode.splats.raster.rasterizer import RasterizerOptions, SplatArrays, SplatRasterizer, ViewArrays
 from softmode.splats.splats import SH_DC, quats_from_rotations, rotations_from_quats
 
 Array = NDArray[np.float64]

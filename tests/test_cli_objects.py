@@ -20,8 +20,8 @@ from softmode.cli import main as cli
 from softmode.cli.common import finding_line
 from softmode.cli.main import main
 from softmode.cli.object_options import ObjectOptions, stiffer_box
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.report import Finding
+from softmode.deformables.reduction.options import BuildOptions
+from softmode.deformables.reduction.report import Finding
 from softmode.demonstrations import read_dataset
 from softmode.envs.tasks.lift_soft.task import LiftSoftConfig
 from softmode.envs.tasks.place_in_bin.task import PlaceInBinConfig

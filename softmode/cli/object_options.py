@@ -80,7 +80,7 @@ class ObjectOptions:
     @property
     def preset(self) -> str | None:
         """The preset that is named in place of a file."""
-        from softmode.objects.presets import PRESETS
+        from softmode.objects.shapes.presets import PRESETS
 
         return str(self.file) if str(self.object) in PRESETS else None
 
@@ -149,7 +149,7 @@ class ObjectOptions:
             ConfigError: If an option says nothing about this object, or the task cannot have it.
         """
         from softmode.objects.object_file import read_object, stored_material
-        from softmode.objects.presets import find_preset
+        from softmode.objects.shapes.presets import find_preset
 
         thing = self.object_of(config.scene.object).pinned()
         stored = {} if thing.body is None else stored_material(read_object(thing.body).body)

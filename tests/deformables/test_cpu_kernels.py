@@ -13,15 +13,11 @@ from softmode.deformables.contact import detection_kernels, sample_cpu_kernels
 from softmode.deformables.contact.detection_kernels import CULLED
 from softmode.deformables.materials.material_kernels import MaterialModel
 from softmode.deformables.model.authoring import add_reduced_body
-from softmode.deformables.solver import (
-    assembly_cpu_kernels,
-    assembly_kernels,
-    constraint_cpu_kernels,
-    point_cpu_kernels,
-    step_kernels,
-)
+from softmode.deformables.model.newton_step_kernels import ALL
+from softmode.deformables.potential import constraint_cpu_kernels, point_cpu_kernels
+from softmode.deformables.solver import step_kernels
 from softmode.deformables.solver.evaluate import assemble, evaluate, gather_gradient, solve
-from softmode.deformables.solver.iteration_kernels import ALL
+from softmode.deformables.system import assembly_cpu_kernels, assembly_kernels
 from tests.bodies import cube
 from tests.deformables.test_fused_system import loaded
 from tests.scenes import Scene, random_rotation

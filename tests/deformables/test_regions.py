@@ -14,11 +14,11 @@ import pytest
 
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.body.regions import Envelope, Region
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_box, quadrature_from_capsule
-from softmode.deformables.build.quadrature_grid import Quadrature
-from softmode.deformables.build.region_samples import pieces_near, refine_at_faces
+from softmode.deformables.quadrature.quadrature import quadrature_from_box, quadrature_from_capsule
+from softmode.deformables.quadrature.quadrature_grid import Quadrature
+from softmode.deformables.reduction.build_body import build_body
+from softmode.deformables.reduction.options import BuildOptions
+from softmode.deformables.reduction.region_samples import pieces_near, refine_at_faces
 from softmode.errors import BasisError, ConfigError
 from tests.bodies import assert_same
 
