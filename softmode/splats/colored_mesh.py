@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from softmode.errors import AssetError
 from softmode.files import damage_errors
-from softmode.foreign.child.surface import GREY
+from softmode.foreign.child.surface import GREY as GREY
 from softmode.foreign.child.surface import gathered
 
 if TYPE_CHECKING:

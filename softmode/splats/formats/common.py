@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from softmode.errors import AssetError
-from softmode.files import REEXPORT
+from softmode.files import REEXPORT as REEXPORT
 from softmode.files import damage_errors
 from softmode.foreign.child.surface import near_zero
 from softmode.splats.splats import MAX_SPLATS, SH_DC, Splats

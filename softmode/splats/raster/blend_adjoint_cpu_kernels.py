@@ -25,7 +25,7 @@ from softmode.splats.raster.blend_cpu_kernels import (
     tile_place,
     vec16,
 )
-from softmode.splats.raster.blend_cpu_kernels import TILE_THREADS
+from softmode.splats.raster.blend_cpu_kernels import TILE_THREADS as TILE_THREADS
 from softmode.splats.raster.lane_ops import highest_bit, lowest_bit
 from softmode.splats.raster.rasterizer_kernels import TILE, Frame, ImageLoss, asked_of_pixel
 
