@@ -485,7 +485,7 @@ def test_help_fits_a_screen_and_has_an_example(
     """Every group of options is at most a screen high; the example is a command line of this command that parses."""
     monkeypatch.setenv("COLUMNS", "80")
     said = help_of(command.split(), capsys)
-    titles = [k for k, line in enumerate(said) if re.match(r"\W*(positional arguments|(toy )?options)\W*$", line)]
+    titles = [k for k, line in enumerate(said) if re.match(r"\W*(positional arguments|((toy|arm) )?options)\W*$", line)]
     heights = np.diff([*titles, len(said)])
     assert len(titles) and heights.max() <= SCREEN, heights
     (example,) = [line for line in said if line.startswith("Example: ")]
