@@ -108,7 +108,10 @@ class RadianceGrid:
         if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[1] > box[0]).all():
             raise AssetError(f"{name}: bounds are no corners (2, 3) with upper > lower", hint="give metres")
         if len(shape) != 3 or min(shape) < 2:
-            raise AssetError(f"{name}: density has shape {shape}, expected (nx, ny, nz) of at least 2 nodes each")
+            raise AssetError(
+                f"{name}: density has shape {shape}, expected (nx, ny, nz) of at least 2 nodes each",
+                hint="give numbers on the nodes of a box",
+            )
         return cls(density=np.asarray(density), sh=np.asarray(sh), origin=box[0],
                    axes=np.diag((box[1] - box[0]) / (np.array(shape) - 1)), name=name)  # fmt: skip
 
