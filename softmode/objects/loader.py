@@ -94,9 +94,9 @@ def object_config(source: Source | str | os.PathLike[str] | None, **options: Any
         return source.changed(**options).located()
     if source is None:
         return ObjectConfig(**options)
-    if str(source) in PRESETS:
-        return ObjectConfig(preset=str(source), **options)
     if isinstance(source, str | os.PathLike):
+        if os.fspath(source) in PRESETS:
+            return ObjectConfig(preset=os.fspath(source), **options)
         kind = file_kind(source)
         return ObjectConfig(**{"splat" if kind == "points" else kind: Path(source)}, **options)
     if isinstance(source, Splats):
