@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+pytest.importorskip("pxr", reason="needs the extra [usd]")
+
 from softmode.errors import AssetError
 from softmode.objects import load
 from softmode.objects.stage.scene import read_usd_scene
