@@ -17,7 +17,7 @@ ENVIRONMENTS = {
     "softmode/LiftSoft-v0": "Pick a soft object from a table and hold it at a goal.",
     "softmode/PushSoft-v0": "Push a soft object over the table to a goal.",
     "softmode/PressSoft-v0": "Press on a soft pad of unknown stiffness and hold a contact force.",
-    "softmode/PlaceInBin-v0": "Put a soft toy into a bin with other soft objects in it.",
+    "softmode/PlaceInBin-v1": "Put a soft toy into a bin with other soft objects in it.",
     "softmode/RopeRoute-v0": "Lead a soft rope around pegs, each on its side, to a goal.",
     "softmode/ShapeSoft-v0": "Bend a soft post into a given shape and hold it there.",
     "softmode/PushSoftGoal-v0": "PushSoft, goal-conditioned: for hindsight experience replay.",
@@ -40,7 +40,7 @@ _EPISODE_STEPS = {
 def _register() -> None:
     """Register every environment once; ``softmode.envs.tasks.name.task`` has NameEnv and NameVectorEnv of task Name."""
     for name in ENVIRONMENTS:
-        task = name.removeprefix("softmode/").removesuffix("-v0")
+        task = name.removeprefix("softmode/").rpartition("-v")[0]
         folder = "".join(f"_{c.lower()}" if c.isupper() else c for c in task).lstrip("_")
         module = f"softmode.envs.tasks.{folder}.task"
         if name not in registry:

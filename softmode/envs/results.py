@@ -9,6 +9,7 @@ import numpy as np
 import warp as wp
 
 from softmode.deformables.model.status import status_reasons
+from softmode.envs.handling import HANDLED
 from softmode.envs.task import Task
 from softmode.vector_check.tensors import map_tree
 
@@ -30,12 +31,15 @@ def observation_arrays(task: Task, *, final: bool = False) -> Tree:
 
 def info_arrays(task: Task, *, final: bool = False) -> dict[str, Tree]:
     """Return the infos of all worlds; with `final`, those of the episodes that ended in this step."""
-    success, metrics, parameters, vector, status, index = (task.final_outcome if final else task.outcome).values()
+    outcome = task.final_outcome if final else task.outcome
+    success, safe, handled, metrics, parameters, vector, status, index = outcome.values()
     which = {} if task.object_set is None else {"object": index}
     return {
         **which,
         "is_success": success,
+        "is_safe_success": safe,
         "success": success,
+        **{name: columns_of(handled, k) for k, name in enumerate(HANDLED)},
         "reward_terms": {name: columns_of(task.terms, k) for k, name in enumerate(task.term_names)},
         **{name: columns_of(metrics, k) for k, name in enumerate(task.metric_names)},
         "parameters": {

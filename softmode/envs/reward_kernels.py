@@ -20,6 +20,7 @@ class WorldState:
     object_velocity: wp.array2d[wp.vec3]  # [m/s]
     tool_pose: wp.array[wp.transform]
     finger_force: wp.array2d[wp.vec3]  # [N]
+    load: wp.array[float]  # largest force or strain of late relative to its limit, see `Handling`
     function_start: wp.array[int]
     q: wp.array[wp.vec3d]  # reduced coordinates [m]
     particle_start: wp.array[int]
@@ -86,6 +87,15 @@ def grasped(state: WorldState, world: int):
 def touched(state: WorldState, world: int):
     """Return whether any finger feels an object."""
     return touches(state, world, 0) or touches(state, world, 1)
+
+
+@wp.func
+def care(state: WorldState, world: int):
+    """Return what a grip counts: 1 up to half the limits of force and strain, half at the limits, less beyond.
+
+    The load fades: a blow of a few steps costs the reward of the steps that follow.
+    """
+    return 1.0 / (1.0 + wp.max(2.0 * state.load[world] - 1.0, 0.0))
 
 
 @wp.func

@@ -24,6 +24,7 @@ from softmode.envs import task_kernels as kernels
 from softmode.envs.cameras import FollowCamera, overview, square_camera, wrist_camera
 from softmode.envs.clutter import Arcs, clutter_parameters
 from softmode.envs.end_reason import EndReason
+from softmode.envs.handling import Handling
 from softmode.envs.observation import (
     ObservationLayout,
     Segment,
@@ -262,8 +263,13 @@ class Task:
         self.reward = zeros()
         self.terms = zeros(max(len(self.term_names), 1))
         self.metrics = zeros(max(len(self.metric_names), 1))
+        config = self.config
+        self.handling = Handling(self.scene, self.table.column("friction"), config.strain_limit, config.force_limit)
+        """How gently the objects are handled."""
         self.outcome: dict[str, wp.array] = {
             "success": self.success,
+            "safe": self.handling.safe,
+            "handled": self.handling.handled,
             "metrics": self.metrics,
             "parameters": self.table.values,
             "observation": self.observation,
@@ -302,6 +308,7 @@ class Task:
         self._high = wp.array(self.high, dtype=float, device=device)
         self.state = filled(
             WorldState,
+            self.handling,
             scene,
             scene.controller,
             scene.model.softmode,
@@ -444,7 +451,8 @@ class Task:
         """
         names = ("seed", "episode", "elapsed", "end", "failure", "held", "terminated", "truncated", "success", "done")
         written = ("finite", "observation", "reward", "terms", "metrics")
-        return {"parameters": self.table.values, **{name: getattr(self, name) for name in (*names, *written)}}
+        own = {name: getattr(self, name) for name in (*names, *written)}
+        return {"parameters": self.table.values, **own, **self.handling.state_arrays()}
 
     def marker(self) -> Splats | Sequence[Splats] | None:
         """Return the splats that mark the goal in pictures, a list for worlds that differ.
@@ -627,6 +635,7 @@ class Task:
         for camera in scene.cameras.values():
             camera.randomize(mask)
         self.launch(kernels.clear_worlds, [mask], [self._episode, self.result])
+        self.handling.forget(mask)
         self.clear()
 
     def use_objects(self) -> None:
@@ -739,7 +748,9 @@ class Task:
         scene = self.scene
         self.failure.zero_()
         self.any_done.zero_()
+        self.handling.watch_grip(fresh, self.state)
         self.evaluate()
+        self.handling.judge(self.result)
         status, lowest = scene.solver.status, self._lowest
         not_finite = bits.WORLD_NOT_FINITE | bits.WORLD_RIGID_NOT_FINITE
         sparse = int(self.config.reward_mode == "sparse" and not self.config.terms_follow_mode)

@@ -75,6 +75,12 @@ class TaskConfig:
     """Range of the random friction coefficient of the object."""
     scale_range: tuple[float, float] | None = None
     """Range of the random size of the objects, as a factor."""
+    strain_limit: float = 0.3
+    """Largest principal strain of an object for a success to be safe."""
+    force_limit: float | None = None
+    """Largest contact force on it [N]; None for 15 N, or three times what holds its weight, if that is more."""
+    care: float = 0.0
+    """Share of the reward for a grip that depends on how gentle it is, 0..1; LiftSoft and PlaceInBin have it."""
     camera: CameraName = "front"
     """Camera of pixel observations: one in front of the table, or one on the hand."""
     image_size: int = 96
@@ -99,6 +105,10 @@ class TaskConfig:
             raise ConfigError("objects_one_hot without objects", hint="give objects=ObjectSet([...])")
         require_numbers("position_range", self.position_range, 2, at_least=0.0, unit="m")
         require_number("others_clearance", self.others_clearance, at_least=0.0, at_most=0.5, unit="m")
+        require_number("strain_limit", self.strain_limit, above=0.0)
+        if self.force_limit is not None:
+            require_number("force_limit", self.force_limit, above=0.0, unit="N")
+        require_number("care", self.care, at_least=0.0, at_most=1.0)
         require_number("yaw_range", self.yaw_range, at_least=0.0, unit="rad")
         for name, limits in _RANGES.items():
             if getattr(self, name) is not None:

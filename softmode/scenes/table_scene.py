@@ -1,6 +1,6 @@
 """A robot arm at a table with soft objects, in any number of worlds: model, solver, controller, cameras, graphs."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -137,6 +137,8 @@ class TableScene:
         self.world_count = world_count
         self.device = wp.get_device(device)
         self.dt = 1.0 / (config.control_hz * config.substeps)
+        self.after_substep: Callable[[int], None] | None = None
+        """Launches after each substep, whose number it is given."""
         self._load(progress)
         with compiling_aside(self.device):
             compile_for_building(self.device, control_kernels, kernels)
@@ -341,7 +343,7 @@ class TableScene:
         self.finger_force = wp.zeros((worlds, 2), dtype=wp.vec3, device=device)
         starts, fingers = model.body_world_start.numpy()[:worlds], finger_links(config.arm, self.arm)
         fingers = np.where(fingers < 0, -1, starts[:, None, None] + fingers)
-        self._finger_body = wp.array(fingers, dtype=int, device=device)
+        self.finger_body = wp.array(fingers, dtype=int, device=device)
         self._bases = self._object_bases()
         self._choice: BodyChoice | None = None
         if self.resampled:
@@ -494,6 +496,8 @@ class TableScene:
             for grips in self.grips:
                 grips.apply(first, self.control, self.dt)
             self.solver.step(first, second, self.control, None, self.dt)
+            if self.after_substep is not None:
+                self.after_substep(substep)
         self.observe()
 
     def observe(self) -> None:
@@ -502,7 +506,7 @@ class TableScene:
         self.controller.measure(state)
         arrays = (state.softmode.q, state.softmode.qd, self.object_position, self.object_velocity)
         launch(self.device, kernels.observe_objects, worlds * len(self.objects), self._bases, *arrays)
-        fingers = (self._finger_body, self.solver.body_wrench, self.finger_force)
+        fingers = (self.finger_body, self.solver.body_wrench, self.finger_force)
         launch(self.device, kernels.observe_fingers, (worlds, 2), *fingers)
 
     def render(self, size: tuple[int, int]) -> SplatCamera:

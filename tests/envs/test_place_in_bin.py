@@ -20,7 +20,7 @@ from softmode.errors import ConfigError
 from softmode.testing import assert_success
 from tests.envs.conftest import Episodes, MakeEnv
 
-ENV_ID = "softmode/PlaceInBin-v0"
+ENV_ID = "softmode/PlaceInBin-v1"
 IDLE = np.array([0.0, 0.0, 0.0, 0.0, 1.0], np.float32)
 BESIDE, FIRST, SECOND = (0.42, -0.12), (0.43, 0.10), (0.47, 0.18)
 """Places of toy, ball and disc."""
@@ -224,14 +224,14 @@ def test_script_grasps_again_what_it_lost(env: PlaceInBinEnv) -> None:
 def test_script_succeeds_on_twenty_of_twenty_seeds(soft_env: MakeEnv, episode: Episodes, modulus: float | None) -> None:
     """20 of 20 seeds with random stiffness, and at either end."""
     options = {} if modulus is None else {"youngs_modulus": modulus}
-    assert_success(episode(soft_env("softmode/PlaceInBin-v0"), options=options))
+    assert_success(episode(soft_env("softmode/PlaceInBin-v1"), options=options))
 
 
 @pytest.mark.slow
 @pytest.mark.episodes(10)
 def test_script_places_plush_toys(soft_env: MakeEnv, episode: Episodes) -> None:
     """10 of 10 seeds among plush toys."""
-    assert_success(episode(soft_env("softmode/PlaceInBin-v0", preset="plush")))
+    assert_success(episode(soft_env("softmode/PlaceInBin-v1", preset="plush")))
 
 
 def through_walls(env: Any, points: np.ndarray) -> bool:

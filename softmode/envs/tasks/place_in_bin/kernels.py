@@ -9,6 +9,7 @@ from softmode.envs.reward_kernels import (
     NEAR,
     StepResult,
     WorldState,
+    care,
     count_held,
     grasped,
     is_there,
@@ -19,8 +20,14 @@ from softmode.envs.reward_kernels import (
 
 wp.set_module_options({"enable_backward": False})
 
-Term = IntEnum("Term", "reach grasp lift carry lower release rest", start=0)
+Term = IntEnum("Term", "reach grasp carry release rest", start=0)
 Metric = IntEnum("Metric", "object_height bin_distance others_inside", start=0)
+
+
+LONGEST = wp.constant(0.5)
+"""Way of a toy from which its potential is 0 [m]."""
+GENTLE = wp.constant(5.0)
+"""Force of a finger that counts half [N]."""
 
 
 @wp.struct
@@ -58,6 +65,7 @@ class Plan:
     clearance: float  # over the rim while carrying [m]
     rest_speed: float  # [m/s]
     hold_steps: int
+    care: float  # share of the reward for a grip that depends on how gentle it is
 
 
 @wp.func
@@ -107,42 +115,57 @@ def observe(state: WorldState, plan: Plan, result: StepResult):
 
 
 @wp.func
-def add_toy(state: WorldState, plan: Plan, w: int, o: int, share: float, result: StepResult):
-    """Add a toy's share of the reward for grasping, lifting, carrying, lowering and letting go."""
-    rim = plan.rim
+def way_to_go(plan: Plan, x: wp.vec3, low: float):
+    """Return how far a held toy still has to be moved: up to where it clears the rim, across, and down [m].
+
+    Near the middle of the bin it need not be so high; the way is continuous, and longer for a toy that is too high.
+
+    Args:
+        plan: The bin.
+        x: Centre of the toy [m].
+        low: Height of its centre at rest on the table [m].
+    """
+    aside = beyond(x, plan.rim, plan.half - wp.vec2(plan.margin, plan.margin))
+    bottom = plan.floor + low
+    clear = bottom + (plan.rim[2] + plan.clearance - plan.floor) * wp.clamp(aside / plan.margin, 0.0, 1.0)
+    return 2.0 * wp.max(clear, x[2]) - x[2] - bottom + aside
+
+
+@wp.func
+def add_toy(state: WorldState, plan: Plan, w: int, o: int, at_hand: bool, share: float, result: StepResult):
+    """Add a toy's share of the reward for reaching, grasping, carrying and letting go; each rises along the task."""
     x = state.object_position[w, o]
     size = state.parameters[w, plan.drawn.scale]
     distance = wp.length(x - tool_position(state, w))
-    inside = inside_bin(plan, x)
-    # fingers may feel another object: only near this one they hold it
-    grip = grasped(state, w) and distance < size * plan.radius[w, o] + NEAR
-    low = plan.heights[w, o] * size
-    carried = rim[2] + low + plan.clearance
-    aside = beyond(x, rim, plan.half - wp.vec2(plan.margin, plan.margin))
-    held_or_in = wp.where(grip or inside, share, 0.0)
-    lift = wp.clamp((x[2] - low) / (carried - low), 0.0, 1.0)
-    lowered = float(0.0)
-    if aside == 0.0:
-        lift = 1.0
-        lowered = wp.clamp((carried - x[2]) / (carried - low - plan.floor), 0.0, 1.0)
-    near = 1.0 - wp.tanh(6.0 * aside)
     reach = 1.0 - wp.tanh(5.0 * distance)
-    if inside:
+    grasp = float(0.0)
+    free = float(0.0)
+    inside = inside_bin(plan, x)
+    # over the bin nothing is lost by letting go: what falls, falls into it
+    over = inside or beyond(x, plan.rim, plan.half - wp.vec2(plan.margin, plan.margin)) == 0.0
+    # fingers may feel another object: only near this one they hold it
+    if over or (grasped(state, w) and distance < size * plan.radius[w, o] + NEAR):
+        grasp = 1.0
+    carry = grasp * wp.max(1.0 - way_to_go(plan, x, plan.heights[w, o] * size) / LONGEST, 0.0)
+    if over:
         reach = 1.0
-        lift = 1.0
-        near = 1.0
+        free = 1.0
+        if at_hand:  # the less the fingers squeeze, the better
+            force = 0.5 * (wp.length(state.finger_force[w, 0]) + wp.length(state.finger_force[w, 1]))
+            free = 1.0 / (1.0 + force / GENTLE)
+    if inside:
+        carry = 1.0
+    else:
+        carry = carry * (1.0 - plan.care + plan.care * care(state, w))
     result.terms[w, Term.reach] += share * reach
-    result.terms[w, Term.grasp] += 0.5 * held_or_in
-    result.terms[w, Term.lift] += lift * held_or_in
-    result.terms[w, Term.carry] += lift * near * held_or_in
-    result.terms[w, Term.lower] += lowered * held_or_in
-    if inside and not touched(state, w):
-        result.terms[w, Term.release] += share
+    result.terms[w, Term.grasp] += 0.5 * share * grasp
+    result.terms[w, Term.carry] += 3.0 * share * carry
+    result.terms[w, Term.release] += 2.0 * share * free
 
 
 @wp.kernel
 def evaluate(state: WorldState, plan: Plan, result: StepResult):
-    """Reward grasping, lifting, carrying, lowering, letting go and leaving the toys at rest, one after another."""
+    """Reward reaching, grasping, carrying, letting go and leaving the toys at rest, one after another."""
     w = wp.tid()
     toy = toy_at_hand(state, plan, w)
     count = int(0)
@@ -158,7 +181,7 @@ def evaluate(state: WorldState, plan: Plan, result: StepResult):
     for o in range(state.slots):
         # what is in the bin has earned its share, what has to wait none
         if is_there(state, w, o) and (o == toy or inside_bin(plan, state.object_position[w, o])):
-            add_toy(state, plan, w, o, 1.0 / float(count), result)
+            add_toy(state, plan, w, o, o == toy, 1.0 / float(count), result)
     result.terms[w, Term.rest] = wp.where(resting, 2.0, 0.0)
     count_held(resting, plan.hold_steps, result, w)
     walls = plan.half + wp.vec2(plan.wall, plan.wall)

@@ -133,6 +133,8 @@ class PlaceInBinConfig(TaskConfig):
     """Half-width of the random positions of the other objects in x and y [m], about places side by side along y."""
     rim_allowance: float = 0.02
     """Height over the rim below which the centre of an object in the bin, maybe upon others, counts as in [m]."""
+    care: float = 0.33
+    """Share of ``carry`` that depends on how gentle the grip is, 0..1."""
     rest_speed: float = 0.03
     """Speed of the toy under which it counts as at rest [m/s]."""
     hold_steps: int = 10
@@ -161,11 +163,11 @@ class PlaceInBinConfig(TaskConfig):
 class PlaceInBin(Task):
     """Put the toy into the bin, let it go, and leave the other objects in.
 
-    Reward terms: ``reach`` (0..1, tool to toy), ``grasp`` (0 or 0.5, both fingers hold it), ``lift`` (0..1, share of
-    the height that clears the rim), ``carry`` (0..1, nearness to the bin, times that share), ``lower`` (0..1, how far
-    down over the bin), ``release`` (0 or 1, in the bin and no finger touches anything), ``rest`` (0 or 2, and it rests,
-    all other objects being in the bin). What is in the bin keeps the first four. Success: all of that for
-    ``hold_steps`` steps in a row. Failure: ``spilled``, another object is outside the bin's walls.
+    Reward terms: ``reach`` (0..1, tool to toy), ``grasp`` (0 or 0.5, both fingers hold it), ``carry`` (0..3, how little
+    of the way up, across and down is left while it is held), ``release`` (0..2, in or over the bin, how little the
+    fingers squeeze), ``rest`` (0 or 2, no finger touches anything, at rest, all other objects in the bin). What is in
+    or over the bin keeps ``reach`` and ``grasp``, held or not. Success: ``rest`` for ``hold_steps`` steps in a row.
+    Failure: ``spilled``, another object is outside the bin's walls.
 
     Of several toys (`ObjectSet.per_world`) each earns its share of the terms, those in the bin and the first that is
     not; the figures are those of the latter. Success: all toys are in.

@@ -1,0 +1,95 @@
+"""How gently the objects of a task are handled: peaks over all substeps of an episode, drops and slips, and limits."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import warp as wp
+
+from softmode.deformables.model.structs import filled
+from softmode.envs import handling_kernels as kernels
+from softmode.errors import ConfigError
+from softmode.robots.jaws import ParallelJaw
+from softmode.scenes.table_scene import TableScene
+
+HANDLED = tuple(kernels.Handled.__members__)
+"""Names of the figures."""
+
+
+class Handling:
+    """Figures of the episode of every world, kept on the device; `TableScene.after_substep` feeds them.
+
+    The force is that of a link or finger on all soft bodies together, so what a finger presses on the table with is no
+    part of it. Strains and energies are those of the objects of the task (`TableScene.slots`), at their cubature points.
+
+    Args:
+        scene: The scene.
+        friction: Column of the parameters that holds the objects' friction.
+        strain_limit: Largest principal strain of a safe success.
+        force_limit: Largest contact force of a safe success [N]; None for 15 N, or three times the force of each finger
+            that holds the heaviest object's weight by friction, if that is more.
+
+    Attributes:
+        handled: `HANDLED`, shape (world_count, 5): contact force [N], principal strain and energy density [J/m^3] at
+            their peaks, and counts of drops and slips.
+        safe: Whether the task is solved and no peak is above its limit.
+        load: Largest force or strain of the last control step relative to its limit, or 0.95 of the load a step ago.
+        force_limit: The limit of each world [N].
+    """
+
+    def __init__(self, scene: TableScene, friction: int, strain_limit: float, force_limit: float | None) -> None:
+        """Allocate the figures and watch the scene."""
+        worlds, device = scene.world_count, scene.device
+        self._scene, self._strain_limit = scene, strain_limit
+        try:
+            pads = ParallelJaw.of(scene.config.arm).friction
+        except ConfigError:  # a robot without a gripper holds nothing
+            pads = 1.0
+        force = -1.0 if force_limit is None else force_limit
+        self._limits = filled(kernels.Limits, strain=strain_limit, force=force, pad_friction=pads, friction=friction)
+        self.handled = wp.zeros((worlds, len(HANDLED)), dtype=float, device=device)
+        self.safe = wp.zeros(worlds, dtype=wp.bool, device=device)
+        self.step_force, self.step_strain, self.load, self.force_limit, self.height = (
+            wp.zeros(worlds, dtype=float, device=device) for _ in range(5)
+        )
+        self.held_slot, self.falling_slot = (wp.full(worlds, -1, dtype=int, device=device) for _ in range(2))
+        self.grip = wp.zeros(worlds, dtype=wp.vec3, device=device)
+        self._kept = filled(kernels.Handling, self)
+        scene.after_substep = self._watch
+
+    def state_arrays(self) -> dict[str, wp.array]:
+        """Return what an episode goes on from."""
+        return {f"handling.{name}": getattr(self, name) for name in kernels.Handling.vars}
+
+    def _launch(self, kernel: wp.Kernel, dim: Any, *inputs: Any) -> None:
+        """Launch a kernel."""
+        wp.launch(kernel, dim=dim, inputs=list(inputs), device=self._scene.device)
+
+    def _watch(self, substep: int) -> None:
+        """Raise the peaks after a substep."""
+        scene, tables = self._scene, self._scene.solver.tables
+        fingers = (scene.model.body_world_start, tables.body_wrench, scene.finger_body)
+        self._launch(
+            kernels.watch_forces, scene.world_count, int(substep == 0), *fingers, self.step_force, self.step_strain
+        )
+        dim = (scene.world_count, scene.slots, tables.layout.point_max)
+        bodies = (len(scene.objects), tables.instances, tables.basis, tables.arrays.q)
+        self._launch(kernels.watch_deformation, dim, *bodies, self.handled, self.step_strain)
+
+    def watch_grip(self, fresh: wp.array, state: Any) -> None:
+        """Take note of a control step, before it is judged.
+
+        Args:
+            fresh: Worlds whose step was a reset.
+            state: `WorldState`.
+        """
+        given = (self._scene.solver.tables.instances, self._scene.model.gravity, self._kept)
+        self._launch(kernels.watch_grip, self._scene.world_count, fresh, self._limits, state, *given)
+
+    def judge(self, result: Any) -> None:
+        """Say whether successes are safe."""
+        self._launch(kernels.judge, self._scene.world_count, self._strain_limit, self._kept, result)
+
+    def forget(self, world_mask: wp.array) -> None:
+        """Begin the episodes of the masked worlds."""
+        self._launch(kernels.forget_handling, self._scene.world_count, world_mask, self._kept)
