@@ -130,6 +130,10 @@ class Evaluate:
     """What the policy sees; as in its run if omitted."""
     env_options: str = "{}"
     """Further keyword arguments of the environment as JSON."""
+    strain_limit: float | None = None
+    """Largest principal strain of a safe success; as in the policy's run, or 0.3."""
+    force_limit: float | None = None
+    """Largest contact force of a safe success [N]; as in the policy's run, or 15, or thrice what holds the weight."""
     arm: Annotated[RobotOptions, own_group()] = dataclasses.field(default_factory=RobotOptions)
     """Another robot in place of the built-in arm."""
     toy: Annotated[ObjectOptions, own_group()] = dataclasses.field(default_factory=ObjectOptions)
@@ -146,6 +150,8 @@ class Evaluate:
         policy = load_policy(self.policy, self.device)
         options = {**policy.env_options, **parse_env_options(self.env_options, self.obs_type)}
         options = self.toy.env_options(self.env, options) | self.arm.env_options()
+        limits = {"strain_limit": self.strain_limit, "force_limit": self.force_limit}
+        options |= {name: limit for name, limit in limits.items() if limit is not None}
         device = local_device(self.device)
         with quiet_warp():
             env = make_vector_env(self.env, self.num_envs, device, options)

@@ -20,7 +20,7 @@ class Handling:
     """Figures of the episode of every world, kept on the device; `TableScene.after_substep` feeds them.
 
     The force is that of a link or finger on all soft bodies together, so what a finger presses on the table with is no
-    part of it. Strains and energies are those of the objects of the task (`TableScene.slots`), at their cubature points.
+    part of it. Strains and energies are those of the objects of the task (`TableScene.slots`), at cubature points.
 
     Args:
         scene: The scene.

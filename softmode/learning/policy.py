@@ -153,6 +153,8 @@ class Evaluation:
     """Standard deviation of the return."""
     mean_length: float
     """Mean length [control steps]."""
+    safe_success_rate: float | None = None
+    """Share of episodes that ended in success within the limits of force and strain; none as above."""
 
     def interval(self) -> tuple[float, float]:
         """Return the 95 % interval of the success rate (Wilson 1927)."""
@@ -165,7 +167,8 @@ class Evaluation:
         if self.success_rate is None:
             return line
         low, high = self.interval()
-        return f"{line}, success {100 * self.success_rate:.1f} % (95 %: {100 * low:.1f} to {100 * high:.1f})"
+        line = f"{line}, success {100 * self.success_rate:.1f} % (95 %: {100 * low:.1f} to {100 * high:.1f})"
+        return line if self.safe_success_rate is None else f"{line}, safe success {100 * self.safe_success_rate:.1f} %"
 
 
 @torch.no_grad()
@@ -195,7 +198,7 @@ def evaluate(
     require_number("episodes", episodes, at_least=1, hint="give a count like 200")
     if isinstance(env, gym.vector.VectorEnv):
         return _evaluate_vector(env, policy, episodes, seed, torch.device(device))
-    returns, lengths, successes = [], [], []
+    returns, lengths, outcomes = [], [], []
     for k in range(episodes):
         observation, info = env.reset(seed=seed + k)
         total, length, done = 0.0, 0, False
@@ -204,9 +207,9 @@ def evaluate(
             total, length, done = total + float(reward), length + 1, terminated or truncated
         returns.append(total)
         lengths.append(length)
-        successes.append(info.get("is_success"))
-    known = all(success is not None for success in successes)
-    return _summary(np.array(returns), np.array(lengths), np.array(successes, float) if known else None)
+        outcomes.append((info.get("is_success"), info.get("is_safe_success")))
+    known = (np.array(column, float) if None not in column else None for column in zip(*outcomes, strict=True))
+    return _summary(np.array(returns), np.array(lengths), *known)
 
 
 def _evaluate_vector(
@@ -221,7 +224,7 @@ def _evaluate_vector(
     ended: list[torch.Tensor] = []
     observation, _ = env.reset(seed=seed)
     just_reset = torch.zeros(n, dtype=torch.bool, device=device)
-    knows = False
+    knows = [False, False]
     step_index = 0
     while True:
         step = worlds.step_raw(policy(observation))
@@ -231,9 +234,9 @@ def _evaluate_vector(
         sums[0] += step.reward * valid
         sums[1] += valid
         counted = done & (played < quota)
-        success = torch.zeros(n, device=device) if step.success is None else step.success
-        knows |= step.success is not None
-        ended.append(torch.stack([counted.float(), sums[0], sums[1], success]))
+        known = [torch.zeros(n, device=device) if given is None else given for given in (step.success, step.safe)]
+        knows = [k or given is not None for k, given in zip(knows, (step.success, step.safe), strict=True)]
+        ended.append(torch.stack([counted.float(), sums[0], sums[1], *known]))
         played += counted
         sums *= (~done).float()
         just_reset = done
@@ -243,11 +246,15 @@ def _evaluate_vector(
             break
     table = torch.stack(ended).permute(0, 2, 1).flatten(0, 1).cpu().numpy()
     table = table[table[:, 0] > 0]
-    return _summary(table[:, 1], table[:, 2], table[:, 3] if knows else None)
+    successes, safe = (table[:, 3 + k] if told else None for k, told in enumerate(knows))
+    return _summary(table[:, 1], table[:, 2], successes, safe)
 
 
-def _summary(returns: np.ndarray, lengths: np.ndarray, successes: np.ndarray | None) -> Evaluation:
+def _summary(
+    returns: np.ndarray, lengths: np.ndarray, successes: np.ndarray | None, safe: np.ndarray | None
+) -> Evaluation:
     return Evaluation(
+        safe_success_rate=None if safe is None else float(np.mean(safe)),
         episodes=len(returns),
         success_rate=None if successes is None else float(np.mean(successes)),
         mean_return=float(np.mean(returns)),

@@ -25,6 +25,7 @@ class Step(NamedTuple):
     success: torch.Tensor | None  # (n,) float32, of the state before a reset
     terms: dict[str, torch.Tensor]  # terms of the reward, (n,) float32 each
     raw: Any  # the observation as the environment gave it
+    safe: torch.Tensor | None = None  # (n,) float32, likewise: success within the limits of force and strain
 
 
 def tensors_of(observation: Any, interface: Interface, device: torch.device) -> Observation:
@@ -109,7 +110,7 @@ class TensorVectorEnv:
             final = self._final(info["final_obs"], observation)
             last = info.get("final_info", {})
         source = last if self.same_step and last is not None else info
-        success = source.get("is_success")
+        success, safe = source.get("is_success"), source.get("is_safe_success")
         terms = info.get("reward_terms", {})
         return Step(
             self._observation(observation),
@@ -120,6 +121,7 @@ class TensorVectorEnv:
             None if success is None else self._tensor(success, torch.float32),
             {key: self._tensor(value, torch.float32) for key, value in terms.items() if not key.startswith("_")},
             observation,
+            None if safe is None else self._tensor(safe, torch.float32),
         )
 
     def _tensor(self, value: Any, dtype: torch.dtype) -> torch.Tensor:

@@ -206,13 +206,13 @@ def test_toys_are_placed_one_after_another() -> None:
         assert not terminated
         inside = int(info["others_inside"])
         terms = info["reward_terms"]
-        assert inside / 3 <= terms["reach"] <= 1.0 and terms["lift"] >= inside / 3 - 1e-6
+        assert inside / 3 <= terms["reach"] <= 1.0 and terms["carry"] >= inside - 1e-6
         placed[inside] = reward
         if info["is_success"]:
             break
     assert info["is_success"] and list(placed) == [0, 1, 2]
     assert reward == pytest.approx(sum(terms.values()))
-    assert terms["rest"] == 2.0 and terms["release"] == pytest.approx(1.0)
+    assert terms["rest"] == 2.0 and terms["release"] == pytest.approx(2.0)
 
 
 def test_one_toy_of_several_is_placed_as_alone() -> None:
