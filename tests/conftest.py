@@ -14,6 +14,7 @@ import pytest
 
 from tests.build_sources import sources_hash
 from tests.compile_once import compile_once
+from tests.task_ids import IDS
 
 if TYPE_CHECKING:
     import gymnasium as gym
@@ -148,7 +149,7 @@ def make_env(soft_env: Callable[..., gym.Env]) -> Callable[..., gym.Env]:
     def make(task: str, obs_type: str = "state") -> gym.Env:
         """Return the environment as it is registered; where it draws pictures, with the cameras of films."""
         films = {} if obs_type == "state" else {"render_mode": "rgb_array"}
-        return soft_env(f"softmode/{task}-v0", obs_type=obs_type, **films)
+        return soft_env(IDS[task], obs_type=obs_type, **films)
 
     return make
 

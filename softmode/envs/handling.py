@@ -55,7 +55,7 @@ class Handling:
         self.held_slot, self.falling_slot = (wp.full(worlds, -1, dtype=int, device=device) for _ in range(2))
         self.grip = wp.zeros(worlds, dtype=wp.vec3, device=device)
         self._kept = filled(kernels.Handling, self)
-        scene.after_substep = self._watch
+        scene.after_substep = self.watch
 
     def state_arrays(self) -> dict[str, wp.array]:
         """Return what an episode goes on from."""
@@ -65,7 +65,7 @@ class Handling:
         """Launch a kernel."""
         wp.launch(kernel, dim=dim, inputs=list(inputs), device=self._scene.device)
 
-    def _watch(self, substep: int) -> None:
+    def watch(self, substep: int) -> None:
         """Raise the peaks after a substep."""
         scene, tables = self._scene, self._scene.solver.tables
         fingers = (scene.model.body_world_start, tables.body_wrench, scene.finger_body)

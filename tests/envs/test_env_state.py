@@ -17,6 +17,7 @@ from softmode.errors import ConfigError, StateError
 from softmode.files import archive_bytes
 from softmode.splats.cameras.camera_randomization import CameraRandomization
 from tests.envs.conftest import MakeEnv
+from tests.task_ids import IDS
 
 TASKS = ("LiftSoft", "PushSoft", "PressSoft", "ShapeSoft", "RopeRoute", "PlaceInBin")
 WORLDS = 3
@@ -24,7 +25,7 @@ WORLDS = 3
 
 def make(task: str, **options: Any) -> SoftEnv:
     """Return a bare environment of a task, of its own: of other options, or beside the one that tests share."""
-    return bare(gym.make(f"softmode/{task}-v0", **options))
+    return bare(gym.make(IDS[task], **options))
 
 
 def bare(env: gym.Env) -> SoftEnv:
@@ -35,7 +36,7 @@ def bare(env: gym.Env) -> SoftEnv:
 
 def make_vec(task: str = "PushSoft", **options: Any) -> SoftVectorEnv:
     """Return a task's vector environment of three worlds."""
-    env = gym.make_vec(f"softmode/{task}-v0", num_envs=WORLDS, **options)
+    env = gym.make_vec(IDS[task], num_envs=WORLDS, **options)
     assert isinstance(env, SoftVectorEnv)
     return env
 
@@ -94,7 +95,7 @@ def test_a_run_goes_on_with_the_same_bits(make_env: MakeEnv, task: str, drawn: b
         ranges = {"density_range": (200.0, 300.0), "friction_range": (0.5, 0.9), "scale_range": (0.95, 1.05)}
         if task == "ShapeSoft":  # its object is clamped, and keeps its scale
             del ranges["scale_range"]
-        varied = replace(config_class(f"softmode/{task}-v0")(), camera_randomization=cameras, image_size=48, **ranges)
+        varied = replace(config_class(IDS[task])(), camera_randomization=cameras, image_size=48, **ranges)
         options = {"obs_type": "pixels_agent_pos", "config": varied}
     env = make(task, **options) if drawn else bare(make_env(task))
     play_until_held(env)

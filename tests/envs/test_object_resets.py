@@ -41,6 +41,7 @@ from tests.envs.object_kinds import (
     posts,
     ropes,
 )
+from tests.task_ids import IDS
 
 SET = ObjectSet(KINDS, materials=MATERIALS, resample=True)
 STEPS = 22
@@ -108,7 +109,7 @@ def test_each_reset_of_each_world_is_as_alone(task: str) -> None:
     filmed = task in ("PushSoft", "ShapeSoft")
     film = {"render_mode": "rgb_array" if filmed else None, "device": "cpu"}
     many = kind(2, config=config, **film)
-    single_kind = env_class(f"softmode/{task}-v0")
+    single_kind = env_class(IDS[task])
     singles = [single_kind(config=alone_in(config, k), **film) for k in range(2)]
     for seed, objects in enumerate(((0, 1), (1, 0))):
         _, infos = many.reset(seed=seed, options={"object": list(objects)})

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-import softmode
 from softmode.envs.reward_kernels import TOUCH_FORCE
 from softmode.envs.scripted import scripted_policy
 from tests.envs.conftest import MakeEnv
+from tests.task_ids import IDS
 
 DISCOUNT = 0.98
-TASKS = {name.split("/")[1].split("-")[0]: name for name in softmode.ENVIRONMENTS if "Goal" not in name}
+TASKS = {task: name for task, name in IDS.items() if "Goal" not in task}
 GRASPS = ("LiftSoft", "PlaceInBin", "RopeRoute")
 rest = pytest.mark.rest
 
@@ -82,7 +82,9 @@ def test_placing_is_worth_more_than_any_part_of_it(make_env: MakeEnv) -> None:
 
 
 @rest
-@pytest.mark.parametrize(("name", "count"), [("PlaceInBin", 10), *((name, 3) for name in TASKS if name != "PlaceInBin")])
+@pytest.mark.parametrize(
+    ("name", "count"), [("PlaceInBin", 10), *((name, 3) for name in TASKS if name != "PlaceInBin")]
+)
 def test_success_is_worth_more_than_any_part_of_it(make_env: MakeEnv, name: str, count: int) -> None:
     """The order of values of every task, on medians over seeds."""
     check_order(make_env(name).unwrapped, name, range(count))
@@ -115,18 +117,59 @@ def test_no_ditch_lies_on_the_way_to_the_bin(make_env: MakeEnv) -> None:
         assert means[k] - noisy < max(means[k : k + 11]) - means[k] + 0.35, k
 
 
-def adversaries(envs: Any, step: int, observation: NDArray[Any]) -> NDArray[np.float32]:
-    """Return the actions of six worlds: random, constant, ramming, throwing, squashing, and driven at the walls."""
-    random = np.random.default_rng(step)
-    segments = envs.unwrapped.segments_of_state
-    way = observation[:, segments["object_offset"]]
+ADVERSARIES = ("random", "constant", "ramming", "throwing", "squashing", "at the walls")
+
+
+def adversaries(step: int, way: NDArray[Any], random: np.random.Generator) -> NDArray[np.float32]:
+    """Return an action of each adversary.
+
+    Args:
+        step: Control step.
+        way: From the tool to the object [m], shape (6, 3).
+        random: Source of the random one.
+    """
     towards = np.clip(way / 0.015, -1.0, 1.0)
-    actions = np.zeros((6, 5), np.float32)
+    above = np.abs(way[:, :2]).max(axis=1) < 0.01
+    actions = np.zeros((len(ADVERSARIES), 5), np.float32)
     actions[0] = random.uniform(-1.0, 1.0, 5)
     actions[1] = [0.3, 0.3, -1.0, 0.0, -1.0]
     actions[2] = [*towards[2], 0.0, -1.0]
-    closing = step > 25
-    actions[3] = [0.0, 1.0, 1.0, 0.0, 1.0 if step > 50 else -1.0] if step > 40 else [*towards[3], 0.0, -1.0 if closing else 1.0]
-    actions[4] = [*towards[4, :2], -1.0 if np.abs(way[4, :2]).max() < 0.01 else 0.3, 0.0, -1.0]
-    actions[5] = [*towards[5], 0.0, -1.0] if step < 40 else [0.0, 1.0, 0.2 if step < 80 else -1.0, 0.0, -1.0]
+    # grasped from where it comes down open, swung up and sideways, let go at full speed
+    actions[3] = [*towards[3], 0.0, 1.0 if step < 25 else -1.0] if step < 35 else [0.0, 1.0, 1.0, 0.0, -1.0]
+    if step > 45:
+        actions[3, 4] = 1.0
+    actions[4] = [*towards[4, :2], -1.0 if above[4] else 0.3, 0.0, -1.0]
+    # the same grasp, dragged along the table against the bin's wall and pressed there
+    actions[5] = [*towards[5], 0.0, 1.0 if step < 25 else -1.0] if step < 35 else [0.0, 1.0, -0.1, 0.0, -1.0]
     return actions
+
+
+def check_adversaries(name: str, seeds: range) -> None:
+    """Check that in whole episodes no adversary succeeds, and that the throw and the blow are seen."""
+    envs: Any = gym.make_vec(TASKS[name], num_envs=len(ADVERSARIES), autoreset_mode="Disabled")
+    columns, random = envs.unwrapped.task_columns("object_offset"), np.random.default_rng(0)
+    for seed in seeds:
+        observation, infos = envs.reset(seed=[seed] * len(ADVERSARIES))
+        won, over = np.zeros(len(ADVERSARIES), bool), np.zeros(len(ADVERSARIES), bool)
+        for step in range(envs.spec.max_episode_steps - 1):
+            observation, _, terminated, _, infos = envs.step(adversaries(step, observation[:, columns], random))
+            won |= infos["is_success"] & ~over
+            over |= terminated
+            if over.all():
+                break
+        assert not won.any(), [ADVERSARIES[k] for k in np.flatnonzero(won)]
+        assert infos["peak_force"][2] > 15.0 and infos["peak_force"][4] > 15.0
+    envs.close()
+
+
+@pytest.mark.parametrize("name", ["PlaceInBin"])
+def test_adversaries_never_succeed(name: str) -> None:
+    """Random, constant, ramming, throwing, squashing, pressing at walls: no success in one episode of each."""
+    check_adversaries(name, range(1))
+
+
+@rest
+@pytest.mark.parametrize("name", ["LiftSoft", "PlaceInBin"])
+def test_adversaries_succeed_in_less_than_two_percent(name: str) -> None:
+    """None of 60 episodes with ten seeds is a success."""
+    check_adversaries(name, range(1, 11))

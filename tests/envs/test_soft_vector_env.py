@@ -16,6 +16,7 @@ from softmode.envs.scripted import scripted_policy
 from softmode.envs.soft_vector_env import SoftVectorEnv
 from softmode.envs.tasks.lift_soft.task import LiftSoftConfig, LiftSoftEnv
 from softmode.errors import ConfigError
+from tests.task_ids import IDS
 
 ENV_ID = "softmode/LiftSoft-v0"
 
@@ -186,7 +187,7 @@ def test_what_cannot_be_is_refused_by_name(given: dict[str, Any]) -> None:
 @pytest.mark.parametrize("name", ["LiftSoft", "PushSoft", "PressSoft"])
 def test_soak(name: str) -> None:
     """A hundred thousand random steps: every number finite, every end has a reason, worlds go on."""
-    env = gym.make_vec(f"softmode/{name}-v0", num_envs=16)
+    env = gym.make_vec(IDS[name], num_envs=16)
     env.reset(seed=0)
     ends = 0
     for step in range(100_000 // 16):

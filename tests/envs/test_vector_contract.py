@@ -26,6 +26,7 @@ from softmode.envs.tasks.lift_soft.task import LiftSoftEnv
 from softmode.vector_check import RULES, VALUES
 from softmode.vector_check.values import as_numpy, equal
 from tests.envs.conftest import MakeEnv
+from tests.task_ids import IDS
 
 TASKS = list(softmode.ENVIRONMENTS)
 OBSERVED = {"LiftSoft": "pixels_agent_pos", "PushSoft": "pixels"}
@@ -37,7 +38,7 @@ LIMIT = 4
 
 def name_of(value: Any) -> str:
     """Name a parameter; an id by its task."""
-    return value.name if isinstance(value, AutoresetMode) else str(value).removeprefix("softmode/").removesuffix("-v0")
+    return value.name if isinstance(value, AutoresetMode) else str(value).removeprefix("softmode/").rpartition("-v")[0]
 
 
 each_task = pytest.mark.parametrize("task", TASKS, ids=name_of)
@@ -248,7 +249,7 @@ def test_worker_processes(make_env: MakeEnv, context: str, task: str, obs_type: 
     multiprocessing.set_forkserver_preload(["mujoco_warp", LiftSoftEnv.__module__])
     single = make_env(task, obs_type)
     # "softmode:" imports the package, which a spawned process has not.
-    factory = functools.partial(gym.make, f"softmode:softmode/{task}-v0", obs_type=obs_type)
+    factory = functools.partial(gym.make, f"softmode:{IDS[task]}", obs_type=obs_type)
     workers = AsyncVectorEnv([factory], context=context)
     try:
         assert equal(one(workers.reset(seed=3)[0]), single.reset(seed=3)[0])
