@@ -62,6 +62,7 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
     beyond the bounds of ``observation_space`` (an object thrown off the table) are clipped to them.
 
     The reward is the sum of ``info["reward_terms"]``. ``info`` also holds ``is_success``, the task's figures,
+    how gently objects were handled (:class:`softmode.envs.handling.Handling`), ``is_safe_success``,
     ``finger_force`` [N], ``parameters`` (what was drawn at reset), ``solver_status`` (the solver's flags),
     ``solver_reasons`` (their names, such as "contact_overflow") and ``end_reason`` (:class:`EndReason`); with a set of
     objects (``TaskConfig.objects``) ``object``, which one is there, and ``object_name``, with several per world that of
