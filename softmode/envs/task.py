@@ -734,7 +734,7 @@ class Task:
     def _launches(self) -> None:
         """Launch what a step launches beside the scene's, whose kernels the scene began to compile itself."""
         self.before_step()
-        self.handling.watch(0)
+        self.handling.watch(1)
         self.write_observation()
         self.finish(self.never)
         self.clear()
