@@ -34,7 +34,6 @@ class Handling:
         handled: `HANDLED`, shape (world_count, 5): contact force [N], principal strain and energy density [J/m^3] at
             their peaks, and counts of drops and slips.
         safe: Whether the task is solved and no peak is above its limit.
-        load: Largest force or strain of the last control step relative to its limit, or 0.95 of the load a step ago.
         force_limit: The limit of each world [N].
     """
 
@@ -47,11 +46,11 @@ class Handling:
         except ConfigError:  # a robot without a gripper holds nothing
             pads = 1.0
         force = -1.0 if force_limit is None else force_limit
-        self._limits = filled(kernels.Limits, strain=strain_limit, force=force, pad_friction=pads, friction=friction)
+        self._limits = filled(kernels.Limits, force=force, pad_friction=pads, friction=friction)
         self.handled = wp.zeros((worlds, len(HANDLED)), dtype=float, device=device)
         self.safe = wp.zeros(worlds, dtype=wp.bool, device=device)
-        self.step_force, self.step_strain, self.load, self.force_limit, self.height = (
-            wp.zeros(worlds, dtype=float, device=device) for _ in range(5)
+        self.step_force, self.step_strain, self.force_limit, self.height = (
+            wp.zeros(worlds, dtype=float, device=device) for _ in range(4)
         )
         self.held_slot, self.falling_slot = (wp.full(worlds, -1, dtype=int, device=device) for _ in range(2))
         self.grip = wp.zeros(worlds, dtype=wp.vec3, device=device)

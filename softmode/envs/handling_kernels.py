@@ -18,8 +18,6 @@ SLIP = wp.constant(0.02)
 """How far a held object moves in the grip for a slip [m]."""
 DROP = wp.constant(0.03)
 """How far an object falls that no longer is held for a drop [m]."""
-FADE = wp.constant(0.95)
-"""What is left of a load after a control step."""
 LEAST_FORCE = wp.constant(15.0)
 """Least force limit where none is given [N]."""
 MARGIN = wp.constant(3.0)
@@ -34,7 +32,6 @@ class Handling:
     safe: wp.array[wp.bool]  # success within the limits
     step_force: wp.array[float]  # largest of the last control step [N]
     step_strain: wp.array[float]  # likewise
-    load: wp.array[float]  # the larger of the two relative to its limit, fading
     force_limit: wp.array[float]  # [N]
     held_slot: wp.array[int]  # which object is held, -1 for none
     falling_slot: wp.array[int]  # which is no longer, until it has dropped
@@ -46,7 +43,6 @@ class Handling:
 class Limits:
     """What an object is to be spared."""
 
-    strain: float
     force: float  # [N], negative for that of the object's weight
     pad_friction: float
     friction: int  # column of the parameters
@@ -135,7 +131,7 @@ def watch_grip(
     # In, out:
     handling: Handling,
 ):
-    """Raise peaks and load, count slips and drops, and say what limit holds; once per control step."""
+    """Raise peaks, count slips and drops, and say what limit holds; once per control step."""
     w = wp.tid()
     if fresh[w]:
         handling.step_force[w] = 0.0
@@ -159,7 +155,6 @@ def watch_grip(
     holds = 0.5 * heaviest * wp.length(gravity[w]) / pads
     limit = wp.where(limits.force > 0.0, limits.force, wp.max(LEAST_FORCE, MARGIN * holds))
     handling.force_limit[w] = limit
-    handling.load[w] = wp.max(wp.max(force / limit, strain / limits.strain), FADE * handling.load[w])
     if grasped(state, w):
         x = state.object_position[w, near]
         offset = wp.transform_point(wp.transform_inverse(tool), x)
@@ -198,6 +193,5 @@ def forget_handling(world_mask: wp.array[wp.bool], handling: Handling):
         handling.safe[w] = False
         handling.step_force[w] = 0.0
         handling.step_strain[w] = 0.0
-        handling.load[w] = 0.0
         handling.held_slot[w] = -1
         handling.falling_slot[w] = -1

@@ -20,7 +20,7 @@ class WorldState:
     object_velocity: wp.array2d[wp.vec3]  # [m/s]
     tool_pose: wp.array[wp.transform]
     finger_force: wp.array2d[wp.vec3]  # [N]
-    load: wp.array[float]  # largest force or strain of late relative to its limit, see `Handling`
+    force_limit: wp.array[float]  # of a safe success [N]
     function_start: wp.array[int]
     q: wp.array[wp.vec3d]  # reduced coordinates [m]
     particle_start: wp.array[int]
@@ -91,11 +91,14 @@ def touched(state: WorldState, world: int):
 
 @wp.func
 def care(state: WorldState, world: int):
-    """Return what a grip counts: 1 up to half the limits of force and strain, half at the limits, less beyond.
+    """Return what a grip counts: 1 / (1 + o^2), o the force of the harder finger over a gentle one, relative to it.
 
-    The load fades: a blow of a few steps costs the reward of the steps that follow.
+    Gentle is up to two thirds of the force limit, 10 N as a rule.
     """
-    return 1.0 / (1.0 + wp.max(2.0 * state.load[world] - 1.0, 0.0))
+    gentle = 2.0 / 3.0 * state.force_limit[world]
+    force = wp.max(wp.length(state.finger_force[world, 0]), wp.length(state.finger_force[world, 1]))
+    over = wp.max(force - gentle, 0.0) / gentle
+    return 1.0 / (1.0 + over * over)
 
 
 @wp.func

@@ -609,7 +609,7 @@ class Task:
         """Let episodes begin in the masked worlds, all if None, from where they are: time counts from zero."""
         chosen = np.ones(self.world_count, bool) if mask is None else mask
         counts = (self.elapsed, self.terminated, self.truncated, self.done, self.end, self.terms)
-        for array in (*counts, self.handling.handled, self.handling.load, self.handling.safe):
+        for array in (*counts, self.handling.handled, self.handling.safe):
             values = array.numpy().copy()
             values[chosen] = 0
             array.assign(values)

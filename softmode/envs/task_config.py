@@ -79,8 +79,6 @@ class TaskConfig:
     """Largest principal strain of an object for a success to be safe."""
     force_limit: float | None = None
     """Largest contact force on it [N]; None for 15 N, or three times what holds its weight, if that is more."""
-    care: float = 0.0
-    """Share of the reward for a grip that depends on how gentle it is, 0..1; LiftSoft and PlaceInBin have it."""
     camera: CameraName = "front"
     """Camera of pixel observations: one in front of the table, or one on the hand."""
     image_size: int = 96
@@ -108,7 +106,6 @@ class TaskConfig:
         require_number("strain_limit", self.strain_limit, above=0.0)
         if self.force_limit is not None:
             require_number("force_limit", self.force_limit, above=0.0, unit="N")
-        require_number("care", self.care, at_least=0.0, at_most=1.0)
         require_number("yaw_range", self.yaw_range, at_least=0.0, unit="rad")
         for name, limits in _RANGES.items():
             if getattr(self, name) is not None:

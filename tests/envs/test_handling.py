@@ -77,7 +77,7 @@ def test_a_hand_that_lands_is_felt_beyond_the_bounds_of_observations(lift: LiftS
     for _ in range(25):
         *_, info = lift.step(DOWN)
     assert info["peak_force"] > lift.task.handling.force_limit.numpy()[0]
-    lift.reset(seed=0, options={"position": (0.45, 0.08)})
+    lift.reset(seed=0, options={"position": (0.38, 0.22)})
     for _ in range(25):
         *_, info = lift.step(DOWN)
     assert info["peak_force"] < 0.1

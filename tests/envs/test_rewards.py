@@ -134,8 +134,8 @@ def adversaries(step: int, way: NDArray[Any], random: np.random.Generator) -> ND
     actions[0] = random.uniform(-1.0, 1.0, 5)
     actions[1] = [0.3, 0.3, -1.0, 0.0, -1.0]
     actions[2] = [*towards[2], 0.0, -1.0]
-    # grasped from where it comes down open, swung up and sideways, let go at full speed
-    actions[3] = [*towards[3], 0.0, 1.0 if step < 25 else -1.0] if step < 35 else [0.0, 1.0, 1.0, 0.0, -1.0]
+    # grasped from where it comes down open, swung up and forward, let go at full speed
+    actions[3] = [*towards[3], 0.0, 1.0 if step < 25 else -1.0] if step < 35 else [1.0, 0.0, 1.0, 0.0, -1.0]
     if step > 45:
         actions[3, 4] = 1.0
     actions[4] = [*towards[4, :2], -1.0 if above[4] else 0.3, 0.0, -1.0]

@@ -9,7 +9,6 @@ from softmode.envs.reward_kernels import (
     NEAR,
     StepResult,
     WorldState,
-    care,
     count_held,
     grasped,
     is_there,
@@ -65,7 +64,6 @@ class Plan:
     clearance: float  # over the rim while carrying [m]
     rest_speed: float  # [m/s]
     hold_steps: int
-    care: float  # share of the reward for a grip that depends on how gentle it is
 
 
 @wp.func
@@ -155,8 +153,6 @@ def add_toy(state: WorldState, plan: Plan, w: int, o: int, at_hand: bool, share:
             free = 1.0 / (1.0 + force / GENTLE)
     if inside:
         carry = 1.0
-    else:
-        carry = carry * (1.0 - plan.care + plan.care * care(state, w))
     result.terms[w, Term.reach] += share * reach
     result.terms[w, Term.grasp] += 0.5 * share * grasp
     result.terms[w, Term.carry] += 3.0 * share * carry

@@ -133,8 +133,6 @@ class PlaceInBinConfig(TaskConfig):
     """Half-width of the random positions of the other objects in x and y [m], about places side by side along y."""
     rim_allowance: float = 0.02
     """Height over the rim below which the centre of an object in the bin, maybe upon others, counts as in [m]."""
-    care: float = 0.33
-    """Share of ``carry`` that depends on how gentle the grip is, 0..1."""
     rest_speed: float = 0.03
     """Speed of the toy under which it counts as at rest [m/s]."""
     hold_steps: int = 10
