@@ -78,7 +78,8 @@ class LiftSoft(Task):
 
     Reward terms: ``reach`` (0..1, tool to object), ``grasp`` (0 or 0.5, both fingers touch), ``lift`` (0..1, share of
     the goal's height while grasped), ``goal`` (0..2, nearness to the goal while lifted), ``hold`` (0 or 2, at the
-    goal); ``care`` makes all but ``reach`` depend on how gentle the grip is. Success: at the goal, held by both fingers, for ``hold_steps`` steps in a row.
+    goal); with ``care`` all but ``reach`` depend on how gentle the grip is. Success: at the goal, held by both fingers,
+    for ``hold_steps`` steps in a row.
     """
 
     config: LiftSoftConfig
