@@ -45,8 +45,7 @@ class Handling:
             pads = ParallelJaw.of(scene.config.arm).friction
         except ConfigError:  # a robot without a gripper holds nothing
             pads = 1.0
-        force = -1.0 if force_limit is None else force_limit
-        self._limits = filled(kernels.Limits, force=force, pad_friction=pads, friction=friction)
+        self._limit = (-1.0 if force_limit is None else force_limit, pads, friction)
         self.handled = wp.zeros((worlds, len(HANDLED)), dtype=float, device=device)
         self.safe = wp.zeros(worlds, dtype=wp.bool, device=device)
         self.step_force, self.step_strain, self.force_limit, self.height = (
@@ -86,7 +85,7 @@ class Handling:
             state: `WorldState`.
         """
         given = (self._scene.solver.tables.instances, self._scene.model.gravity, self._kept)
-        self._launch(kernels.watch_grip, self._scene.world_count, fresh, self._limits, state, *given)
+        self._launch(kernels.watch_grip, self._scene.world_count, fresh, *self._limit, state, *given)
 
     def judge(self, result: Any) -> None:
         """Say whether successes are safe."""

@@ -39,15 +39,6 @@ class Handling:
     height: wp.array[float]  # where it was last held [m]
 
 
-@wp.struct
-class Limits:
-    """What an object is to be spared."""
-
-    force: float  # [N], negative for that of the object's weight
-    pad_friction: float
-    friction: int  # column of the parameters
-
-
 @wp.func
 def principal_strain(G: wp.mat33):
     """Return the largest |s - 1| of the principal stretches s of F = I + G.
@@ -77,11 +68,8 @@ def watch_forces(
 ):
     """Raise the force of the control step to the largest of a link, or of a finger, on soft bodies."""
     w = wp.tid()
-    force = float(0.0)
-    if first != 0:
-        step_strain[w] = 0.0
-    else:
-        force = step_force[w]
+    force = wp.where(first != 0, 0.0, step_force[w])
+    step_strain[w] = wp.where(first != 0, 0.0, step_strain[w])
     for b in range(body_start[w], body_start[w + 1]):
         force = wp.max(force, wp.length(wp.spatial_top(body_wrench[b])))
     for f in range(finger_body.shape[1]):
@@ -124,7 +112,9 @@ def watch_deformation(
 @wp.kernel
 def watch_grip(
     fresh: wp.array[wp.bool],  # worlds whose step was a reset
-    limits: Limits,
+    force_limit: float,  # [N], negative for that of the object's weight
+    pad_friction: float,
+    friction: int,  # column of the parameters
     state: WorldState,
     instances: Instances,
     gravity: wp.array[wp.vec3],
@@ -133,13 +123,10 @@ def watch_grip(
 ):
     """Raise peaks, count slips and drops, and say what limit holds; once per control step."""
     w = wp.tid()
-    if fresh[w]:
-        handling.step_force[w] = 0.0
-        handling.step_strain[w] = 0.0
-    force = handling.step_force[w]
-    strain = handling.step_strain[w]
-    handling.handled[w, Handled.peak_force] = wp.max(handling.handled[w, Handled.peak_force], force)
-    handling.handled[w, Handled.peak_strain] = wp.max(handling.handled[w, Handled.peak_strain], strain)
+    if not fresh[w]:
+        handled = handling.handled
+        handled[w, Handled.peak_force] = wp.max(handled[w, Handled.peak_force], handling.step_force[w])
+        handled[w, Handled.peak_strain] = wp.max(handled[w, Handled.peak_strain], handling.step_strain[w])
     tool = state.tool_pose[w]
     near = int(0)
     nearest = float(1.0e9)
@@ -151,10 +138,9 @@ def watch_grip(
             if distance < nearest:
                 nearest = distance
                 near = o
-    pads = wp.sqrt(wp.max(state.parameters[w, limits.friction] * limits.pad_friction, 1.0e-6))
+    pads = wp.sqrt(wp.max(state.parameters[w, friction] * pad_friction, 1.0e-6))
     holds = 0.5 * heaviest * wp.length(gravity[w]) / pads
-    limit = wp.where(limits.force > 0.0, limits.force, wp.max(LEAST_FORCE, MARGIN * holds))
-    handling.force_limit[w] = limit
+    handling.force_limit[w] = wp.where(force_limit > 0.0, force_limit, wp.max(LEAST_FORCE, MARGIN * holds))
     if grasped(state, w):
         x = state.object_position[w, near]
         offset = wp.transform_point(wp.transform_inverse(tool), x)
@@ -178,9 +164,8 @@ def watch_grip(
 def judge(strain_limit: float, handling: Handling, result: StepResult):
     """Say whether a success came within the limits."""
     w = wp.tid()
-    gentle = handling.handled[w, Handled.peak_force] <= handling.force_limit[w]
-    gentle = gentle and handling.handled[w, Handled.peak_strain] <= strain_limit
-    handling.safe[w] = result.success[w] and gentle
+    gently = handling.handled[w, Handled.peak_force] <= handling.force_limit[w]
+    handling.safe[w] = result.success[w] and gently and handling.handled[w, Handled.peak_strain] <= strain_limit
 
 
 @wp.kernel
@@ -191,7 +176,5 @@ def forget_handling(world_mask: wp.array[wp.bool], handling: Handling):
         for k in range(handling.handled.shape[1]):
             handling.handled[w, k] = 0.0
         handling.safe[w] = False
-        handling.step_force[w] = 0.0
-        handling.step_strain[w] = 0.0
         handling.held_slot[w] = -1
         handling.falling_slot[w] = -1

@@ -608,8 +608,8 @@ class Task:
     def begin(self, mask: NDArray[np.bool_] | None = None) -> None:
         """Let episodes begin in the masked worlds, all if None, from where they are: time counts from zero."""
         chosen = np.ones(self.world_count, bool) if mask is None else mask
-        counts = (self.elapsed, self.terminated, self.truncated, self.done, self.end, self.terms)
-        for array in (*counts, self.handling.handled, self.handling.safe):
+        counts = (self.elapsed, self.terminated, self.truncated, self.done, self.end, self.terms, self.handling.handled)
+        for array in counts:
             values = array.numpy().copy()
             values[chosen] = 0
             array.assign(values)
