@@ -16,7 +16,7 @@ wp.set_module_options({"enable_backward": False})
 Handled = IntEnum("Handled", "peak_force peak_strain peak_energy_density drops slips", start=0)
 SLIP = wp.constant(0.02)
 """How far a held object moves in the grip for a slip [m]."""
-DROP = wp.constant(0.03)
+DROP = wp.constant(0.05)
 """How far an object falls that no longer is held for a drop [m]."""
 LEAST_FORCE = wp.constant(15.0)
 """Least force limit where none is given [N]."""
