@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import warp as wp
@@ -60,7 +61,7 @@ class Handling:
         """Return what an episode goes on from."""
         return {f"handling.{name}": getattr(self, name) for name in kernels.Handling.vars}
 
-    def _launch(self, kernel: wp.Kernel, dim: Any, *inputs: Any) -> None:
+    def _launch(self, kernel: wp.Kernel | Callable[..., None], dim: Any, *inputs: Any) -> None:
         """Launch a kernel."""
         wp.launch(kernel, dim=dim, inputs=list(inputs), device=self._scene.device)
 
