@@ -68,7 +68,7 @@ def pytest_configure(config: pytest.Config) -> None:
 def softmode_env() -> Iterator[Callable[..., gym.Env]]:
     """Return a function from an id, and options or fields of the configuration, to an environment.
 
-    ``softmode_env("softmode/PushSoft-v1", obs_type="pixels", goal_tolerance=0.01)``. Equal arguments give the same
+    ``softmode_env("softmode/PushSoft-v0", obs_type="pixels", goal_tolerance=0.01)``. Equal arguments give the same
     environment throughout the session, which an episode resets; ``copy.deepcopy`` gives one of its own.
     """
     made: dict[str, gym.Env] = {}

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from softmode.envs import EnvState, PushSoftConfig, SoftVectorEnv
 from softmode.viz import Film
 
-ENV, AXES = "softmode/PushSoft-v1", 2  # the tool moves in x and y, its height and its fingers stay
+ENV, AXES = "softmode/PushSoft-v0", 2  # the tool moves in x and y, its height and its fingers stay
 KNOTS, HOLD = 3, 8  # a push is so many actions, each held for so many control steps
 ROUNDS, ELITE, FLOOR = 2, 0.1, 0.1  # of the search; share of the worlds that the next round follows; least spread
 

@@ -28,7 +28,7 @@ from softmode.demonstrations import (
 from softmode.learning import policy_factory
 from softmode.viz import Film
 
-ENV, OUT, SEED, ASIDE = "softmode/PushSoft-v1", Path("out/record_and_replay"), 100, 0.03
+ENV, OUT, SEED, ASIDE = "softmode/PushSoft-v0", Path("out/record_and_replay"), 100, 0.03
 
 
 def record(env: gym.Env, episodes: int) -> Dataset:

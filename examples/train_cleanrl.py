@@ -65,7 +65,7 @@ def test_final(history: list[float]) -> None:
 def main(arguments: list[str] | None = None) -> None:
     """Train."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    defaults = {"env-id": "softmode/PushSoft-v1", "device": "cpu", "num-envs": 16, "total-timesteps": 10_000_000}
+    defaults = {"env-id": "softmode/PushSoft-v0", "device": "cpu", "num-envs": 16, "total-timesteps": 10_000_000}
     for name, value in defaults.items():
         parser.add_argument(f"--{name}", type=type(value), default=value)
     parser.add_argument("--short", action="store_true", help="a few seconds, on the pendulum, which it has to learn")

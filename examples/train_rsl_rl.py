@@ -61,7 +61,7 @@ def test_final(before: torch.Tensor, runner: OnPolicyRunner, file: Path, iterati
 def main(arguments: list[str] | None = None) -> None:
     """Train, save, and play."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--env", default="softmode/PushSoft-v1")
+    parser.add_argument("--env", default="softmode/PushSoft-v0")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--num-envs", type=int, default=16)
     parser.add_argument("--iterations", type=int, default=300)

@@ -53,7 +53,7 @@ def test_final(before: torch.Tensor, model: BaseAlgorithm, again: BaseAlgorithm,
 def main(arguments: list[str] | None = None) -> None:
     """Train, save, load, and play."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--env", default="softmode/PushSoft-v1")
+    parser.add_argument("--env", default="softmode/PushSoft-v0")
     parser.add_argument("--device", default="cpu", help="of the simulation")
     parser.add_argument("--num-envs", type=int, default=16)
     parser.add_argument("--steps", type=int, default=1_000_000, help="environment steps of all worlds together")

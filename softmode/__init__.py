@@ -15,10 +15,10 @@ __version__ = "0.2.0"
 
 ENVIRONMENTS = {
     "softmode/LiftSoft-v0": "Pick a soft object from a table and hold it at a goal.",
-    "softmode/PushSoft-v1": "Push a soft object over the table to a goal.",
-    "softmode/PressSoft-v1": "Press on a soft pad of unknown stiffness and hold a contact force.",
+    "softmode/PushSoft-v0": "Push a soft object over the table to a goal.",
+    "softmode/PressSoft-v0": "Press on a soft pad of unknown stiffness and hold a contact force.",
     "softmode/PlaceInBin-v1": "Put a soft toy into a bin with other soft objects in it.",
-    "softmode/RopeRoute-v1": "Lead a soft rope around pegs, each on its side, to a goal.",
+    "softmode/RopeRoute-v0": "Lead a soft rope around pegs, each on its side, to a goal.",
     "softmode/ShapeSoft-v0": "Bend a soft post into a given shape and hold it there.",
     "softmode/PushSoftGoal-v0": "PushSoft, goal-conditioned: for hindsight experience replay.",
     "softmode/LiftSoftGoal-v0": "LiftSoft, goal-conditioned: for hindsight experience replay.",

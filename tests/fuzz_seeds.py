@@ -117,8 +117,8 @@ def _config(path: Path) -> None:
     except ValueError as error:
         raise ConfigError("no text", hint="the shell gives none but texts") from error
     options = located_options(parse_env_options(text), path.parent)
-    joined_config("softmode/PushSoft-v1", *split_config("softmode/PushSoft-v1", options))
-    pinned_options("softmode/PushSoft-v1", options)
+    joined_config("softmode/PushSoft-v0", *split_config("softmode/PushSoft-v0", options))
+    pinned_options("softmode/PushSoft-v0", options)
 
 
 def _run(path: Path) -> None:
@@ -359,7 +359,7 @@ def array_seeds(folder: Path) -> Seeds:
 
         options = {"obs_type": "state", "config": json.loads(_OPTIONS)["config"]}
         write_checkpoint(checkpoint(), folder / "a.npz")
-        write_checkpoint(checkpoint(env="softmode/PushSoft-v1", env_options=options), folder / "b.npz")
+        write_checkpoint(checkpoint(env="softmode/PushSoft-v0", env_options=options), folder / "b.npz")
         found["checkpoint"] = ".npz", "zip", [(folder / name).read_bytes() for name in ("a.npz", "b.npz")]
     return found
 
@@ -415,7 +415,7 @@ def _text_seeds(folder: Path) -> Seeds:
     urdf = urdf.replace('<mesh filename="package://lifter/meshes/arm.dae"/>', '<box size="0.1 0.1 0.1"/>')
     run = folder / "run"
     run.mkdir()
-    (run / "config.json").write_text(json.dumps({"env": "softmode/PushSoft-v1", "env_options": json.loads(_OPTIONS)}))
+    (run / "config.json").write_text(json.dumps({"env": "softmode/PushSoft-v0", "env_options": json.loads(_OPTIONS)}))
     (run / "progress.csv").write_text("iteration,env_steps,loss\n1,100,0.5\n2,200,0.4\n3,300,nan\n")
     (run / "latest.npz").write_bytes(b"")
     return {

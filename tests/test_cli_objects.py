@@ -349,7 +349,7 @@ def test_a_body_file_says_what_it_is_made_of(assets: Path, tmp_path: Path) -> No
         (["bench", ID, "--splat", "none.ply"], "none.ply"),
         (["bench", ID, "--stiffness", "core=1,2"], "core=1,2"),
         (["train", "Pendulum-v1", "--splat", "floater.ply"], "Pendulum-v1"),
-        (["play", "softmode/PushSoft-v1", "--size", "0.1"], "--size given for a cylinder"),
+        (["play", "softmode/PushSoft-v0", "--size", "0.1"], "--size given for a cylinder"),
         (["view", "floater.ply", "--object", "open.obj", "--no-open"], "two objects"),
         (["body", "check"], "no file is given"),
         (["body", "check", "floater.ply", "--splat", "open.obj"], "2 files are given"),

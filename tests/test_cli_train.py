@@ -129,7 +129,7 @@ def test_worlds_in_processes_are_the_same_bits(tmp_path: Path, monkeypatch):
     found = []
     for count in ("1", "2"):
         folder = tmp_path / count
-        arguments = ["train", "softmode/PushSoft-v1", "--run-dir", str(folder), "--processes", count, "--num-envs", "2"]
+        arguments = ["train", "softmode/PushSoft-v0", "--run-dir", str(folder), "--processes", count, "--num-envs", "2"]
         arguments += ["--set", "rollout_steps=4", "hidden=[8]", "epochs=1", "--total-steps", "16"]
         assert cli.main([*arguments, "--eval-episodes", "0"]) == 0
         assert json.loads((folder / "config.json").read_text())["processes"] == int(count)

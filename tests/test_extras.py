@@ -26,7 +26,7 @@ OPTIONAL = (
 CASES = {
     "command line": ("demo", "import softmode.cli.main; softmode.cli.main.main(['list-envs'])"),
     "film": ("demo", "from softmode.viz.film import Film; Film(Path('lift.mp4'))"),
-    "tensors": ("rl", "import softmode, gymnasium as g; g.make_vec('softmode/PushSoft-v1', output='torch')"),
+    "tensors": ("rl", "import softmode, gymnasium as g; g.make_vec('softmode/PushSoft-v0', output='torch')"),
     "Stable-Baselines3": ("rl", "from softmode.envs.adapters import StableBaselinesVecEnv"),
     "rsl_rl": ("rsl-rl", "from softmode.envs.adapters import RslRlVecEnv"),
     "skrl": ("skrl", "from softmode.envs.adapters import SkrlWrapper"),
@@ -34,7 +34,7 @@ CASES = {
     "trained policy": ("rl", "from softmode.learning.policy import load_policy"),
     "policy by file": (
         "rl",
-        "from softmode.learning.players import trained_policy as t; t('a.npz', 'softmode/PushSoft-v1')",
+        "from softmode.learning.players import trained_policy as t; t('a.npz', 'softmode/PushSoft-v0')",
     ),
     "policy to play": ("rl", "from softmode.learning.players import policy_factory as f; f(str(Path('a.npz')), None)"),
     "TensorBoard": ("rl", "from softmode.learning.run_folder import RunFolder as R; R.start_tensorboard(None, None)"),

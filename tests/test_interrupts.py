@@ -70,7 +70,7 @@ def test_a_film_that_is_not_finished_goes(tmp_path: Path, capfd: pytest.CaptureF
     """`play --video` leaves neither film nor hidden file nor the folder it made."""
     made = tmp_path / "out"
     with faults.signalled(signal.SIGTERM, lambda: any(path.stat().st_size > 40 for path in made.glob(".film-*.mp4"))):
-        code = main(["play", "softmode/PushSoft-v1", "--episodes", "100", "--video", str(made / "film.mp4")])
+        code = main(["play", "softmode/PushSoft-v0", "--episodes", "100", "--video", str(made / "film.mp4")])
     assert code == 143 and not list(tmp_path.iterdir())
     assert "nothing was written" in capfd.readouterr().err
 
@@ -115,7 +115,7 @@ def gone(session: int, seconds: float = 20.0) -> bool:
 def test_processes_that_hold_worlds_end_with_training(tmp_path: Path, number: signal.Signals) -> None:
     """None is left whether the parent ends or is killed, and a run that was asked to end can go on."""
     folder = tmp_path / "run"
-    command = ["train", "softmode/PushSoft-v1", "--num-envs", "2", "--processes", "2", "--run-dir", str(folder)]
+    command = ["train", "softmode/PushSoft-v0", "--num-envs", "2", "--processes", "2", "--run-dir", str(folder)]
     command += ["--set", "rollout_steps=4", "minibatches=1", "hidden=[8]"]
     process = faults.start(COMMAND, *command, session=True)
     code, written = faults.end_at(process, lambda line: line.strip().startswith("2 "), number)

@@ -28,7 +28,7 @@ import warp as wp
 def mine(x: wp.array[float]):
     x[wp.tid()] = 1.0
 
-env = gym.make("softmode/PushSoft-v1", render_mode="rgb_array", obs_type="pixels")
+env = gym.make("softmode/PushSoft-v0", render_mode="rgb_array", obs_type="pixels")
 env.reset(seed=0)
 env.step(env.action_space.sample())
 env.render()

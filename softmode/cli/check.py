@@ -15,7 +15,7 @@ from softmode.envs.catalogue import registered_id
 class Check:
     """Check that a task keeps the rules of environments.
 
-    Example: softmode check softmode/PushSoft-v1
+    Example: softmode check softmode/PushSoft-v0
     """
 
     env: str

@@ -43,7 +43,7 @@ def pixels() -> Iterator[Any]:
     from softmode.envs.tasks.push_soft.task import PushSoftConfig
 
     env = gym.make_vec(
-        "softmode/PushSoft-v1",
+        "softmode/PushSoft-v0",
         num_envs=1,
         output="torch",
         obs_type="pixels_agent_pos",

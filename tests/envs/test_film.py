@@ -69,7 +69,7 @@ def test_what_a_film_shows(lift: gym.Env) -> None:
 def test_films_leave_observations_as_they_are(make_env: MakeEnv) -> None:
     """Pictures for a policy are the same, bit for bit, with film cameras and without, before and after a frame."""
     pictures = []
-    for env in (gym.make("softmode/PushSoft-v1", obs_type="pixels"), make_env("PushSoft", "pixels")):
+    for env in (gym.make("softmode/PushSoft-v0", obs_type="pixels"), make_env("PushSoft", "pixels")):
         first, _ = env.reset(seed=3)
         env.render()
         second, *_ = env.step(np.array([0.3, -0.2, -0.8, 0.1, 1.0], np.float32))

@@ -13,7 +13,7 @@ import softmode  # noqa: F401
 from softmode.deformables.model import status as bits
 from softmode.errors import AssetError, ConfigError, WorkerError
 
-TASK = "softmode/PushSoft-v1"
+TASK = "softmode/PushSoft-v0"
 REST = np.zeros((2, 5), np.float32)
 
 

@@ -206,7 +206,7 @@ def test_a_pad_must_not_reach_the_fingers(press: PressSoftEnv) -> None:
 @pytest.mark.episodes(20)
 def test_scripted_policy_succeeds_on_twenty_of_twenty_seeds(soft_env: MakeEnv, episode: Episodes) -> None:
     """20 of 20 seeds with random stiffness, place and force."""
-    assert_success(episode(soft_env("softmode/PressSoft-v1")))
+    assert_success(episode(soft_env("softmode/PressSoft-v0")))
 
 
 def test_fields_are_keywords_and_success_alone_can_be_paid(soft_env: MakeEnv) -> None:
@@ -214,7 +214,7 @@ def test_fields_are_keywords_and_success_alone_can_be_paid(soft_env: MakeEnv) ->
 
     Sparse pays 1 while the task counts as solved, as `success` and `is_success` say, and keeps the terms in the infos.
     """
-    env = soft_env("softmode/PressSoft-v1", reward_mode="sparse", image_size=64, youngs_modulus_range=(1.0e5, 1.0e5))
+    env = soft_env("softmode/PressSoft-v0", reward_mode="sparse", image_size=64, youngs_modulus_range=(1.0e5, 1.0e5))
     bare: Any = env.unwrapped
     assert bare.config == PressSoftConfig(reward_mode="sparse", image_size=64, youngs_modulus_range=(1.0e5, 1.0e5))
     with pytest.raises(ConfigError, match="before the first reset"):
@@ -228,6 +228,6 @@ def test_fields_are_keywords_and_success_alone_can_be_paid(soft_env: MakeEnv) ->
         paid.append((reward, sum(info["reward_terms"].values())))
     assert paid[0][0] == 0.0 and paid[-1][0] == 1.0 and all(dense > 0.0 for _, dense in paid[-10:])
     with pytest.raises(ConfigError, match=r"'image_sise' is no option.*Nearest: image_size"):
-        gym.make("softmode/PressSoft-v1", image_sise=64)
+        gym.make("softmode/PressSoft-v0", image_sise=64)
     with pytest.raises(ConfigError, match="reward_mode is 'shaped'"):
-        gym.make("softmode/PressSoft-v1", reward_mode="shaped")
+        gym.make("softmode/PressSoft-v0", reward_mode="shaped")

@@ -194,7 +194,7 @@ def test_script_succeeds_on_twenty_of_twenty_seeds(
     soft_env: MakeEnv, episode: Episodes, directions: tuple[float, float]
 ) -> None:
     """20 of 20 seeds with random stiffness, place and goal."""
-    assert_success(episode(soft_env("softmode/PushSoft-v1", goal_direction=directions)))
+    assert_success(episode(soft_env("softmode/PushSoft-v0", goal_direction=directions)))
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ from softmode.testing import (
 from softmode.testing.failure import BEFORE, save_failure
 from softmode.testing.golden import write_golden
 
-PRESS = "softmode/PressSoft-v1"
+PRESS = "softmode/PressSoft-v0"
 
 
 @pytest.fixture(scope="module")

@@ -151,7 +151,7 @@ import numpy as np
 from softmode.testing import assert_max_penetration
 
 def env_of(soft_env):
-    return soft_env("softmode/PressSoft-v1", max_episode_steps=12, render_size=64)
+    return soft_env("softmode/PressSoft-v0", max_episode_steps=12, render_size=64)
 
 def test_depth(softmode_env, softmode_episode):
     assert_max_penetration(softmode_episode(env_of(softmode_env), "scripted", 1), 0.001)
@@ -167,7 +167,7 @@ def test_policy(softmode_env, softmode_episode):
 """
 GOLDEN = """
 def test_golden(softmode_env, softmode_episode, softmode_golden):
-    env = softmode_env("softmode/PressSoft-v1", max_episode_steps=12, render_size=64)
+    env = softmode_env("softmode/PressSoft-v0", max_episode_steps=12, render_size=64)
     softmode_golden(softmode_episode(env, "scripted"))
 """
 

@@ -57,7 +57,7 @@ def broken() -> Any:
 
 def test_a_task_of_softmode_passes(capsys: pytest.CaptureFixture[str]) -> None:
     """The command prints a line per check and returns 0."""
-    assert main(["check", "softmode/PressSoft-v1", "--episodes", "2"]) == 0
+    assert main(["check", "softmode/PressSoft-v0", "--episodes", "2"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line[28:].split()[0] for line in lines] == ["ok"] * 6
     assert "2 of 2 episodes" in lines[-1] and "segments" in lines[-2]
@@ -81,4 +81,4 @@ def test_what_is_no_task_is_refused() -> None:
         with pytest.raises(ConfigError, match=message):
             check_task(name)
     with pytest.raises(ConfigError, match="episodes must"):
-        check_task("softmode/PressSoft-v1", episodes=0)
+        check_task("softmode/PressSoft-v0", episodes=0)

@@ -369,7 +369,7 @@ def test_an_interrupted_command_ends_cleanly(saved: str, number: signal.Signals,
 
 def test_an_environment_is_shown_and_followed() -> None:
     """Frames of the robot stand where its links are, the reward is told, sliders follow the next episode's draw."""
-    session = LiveSession.from_env("softmode/PushSoft-v1", device="cpu")
+    session = LiveSession.from_env("softmode/PushSoft-v0", device="cpu")
     with ViewApp(session, ViewOptions(port=0)) as app, PageClient(app.url):
         while not app._server.get_clients():
             time.sleep(0.01)
@@ -399,7 +399,7 @@ def test_an_environment_is_shown_and_followed() -> None:
         (["softmode/Nothing-v0"], "unknown environment"),
         (["--duration", "-1"], "duration"),
         (["a", "b"], "name one"),
-        (["softmode/PushSoft-v1", "--hold", "base"], "--hold says nothing about an environment"),
+        (["softmode/PushSoft-v0", "--hold", "base"], "--hold says nothing about an environment"),
         (["--policy", "zero"], "--policy says nothing about an object"),
     ],
 )
