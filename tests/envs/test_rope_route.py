@@ -71,7 +71,7 @@ def test_scripted_policy_leads_the_rope_around_the_pegs(rope: RopeRouteEnv, rout
     for a soft rope that is squeezed just above it. The reward, the sum of its terms, each within its bounds, grows from
     stage to stage.
     """
-    bounds = {"reach": (0.0, 1.0), "grasp": (0.0, 0.5), "route": (-4.0, 2.0), "goal": (0.0, 2.0), "hold": (0.0, 2.0)}
+    bounds = {"reach": (0.0, 1.0), "grasp": (0.0, 0.5), "route": (-2.0, 2.0), "goal": (0.0, 2.0), "hold": (0.0, 2.0)}
     observation, info = rope.reset(seed=1, options={"route": route, "youngs_modulus": modulus})
     policy, depth, floor, success, rewards = scripted_policy(rope), 0.0, 0.0, [], []
     soft = rope.scene.soft.body

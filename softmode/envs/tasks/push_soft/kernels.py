@@ -113,7 +113,7 @@ def evaluate(state: WorldState, plan: Plan, result: StepResult):
     resting = there and wp.length(state.object_velocity[w, 0]) <= plan.rest_speed
     progress = float(0.0)
     if plan.before[w] >= 0.0:
-        progress = (plan.before[w] - distance) / plan.translation_scale  # not clipped: what is thrown away costs all
+        progress = wp.clamp((plan.before[w] - distance) / plan.translation_scale, -1.0, 1.0)
     plan.before[w] = distance
     result.terms[w, Term.reach] = 0.5 * reach
     result.terms[w, Term.progress] = progress

@@ -100,7 +100,7 @@ class PushSoft(Task):
     """Push the object to a goal on the table and leave it there at rest.
 
     Reward terms: ``reach`` (0..0.5, tool to the side of the object that faces away from the goal), ``progress``
-    (object towards the goal in this step, over the longest tool step), ``goal`` (0..1, nearness to the goal),
+    (-1..1, object towards the goal in this step, over the longest tool step), ``goal`` (0..1, nearness to the goal),
     ``rest`` (0 or 2, at rest at the goal). Success: at rest at the goal for ``hold_steps`` steps in a row.
 
     Yaw is the rotation about the vertical that best maps the observed surface points from rest to where they are, so

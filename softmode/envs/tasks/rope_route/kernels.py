@@ -144,16 +144,13 @@ def evaluate(state: WorldState, plan: Plan, result: StepResult):
     pegs = plan.peg_position.shape[0]
     passed = float(0.0)
     for p in range(pegs):
-        passed += wp.clamp(result.observation[w, plan.columns.winding + p] / plan.winding, -2.0, 1.0) / float(pegs)
-    # over the pegs the rope earns half
-    height = (result.metrics[w, Metric.highest_point] - plan.peg_height) / 0.02
-    lowness = 1.0 - 0.5 * wp.clamp(height, 0.0, 1.0)
+        passed += wp.clamp(result.observation[w, plan.columns.winding + p] / plan.winding, -1.0, 1.0) / float(pegs)
     low = result.metrics[w, Metric.highest_point] < plan.peg_height
     routed = low and result.metrics[w, Metric.least_winding] >= plan.winding
     there = routed and distance <= plan.goal_tolerance
     result.terms[w, Term.reach] = 1.0 - wp.tanh(10.0 * near)
     result.terms[w, Term.grasp] = wp.where(grasped(state, w) and near < 0.03, 0.5, 0.0)
-    result.terms[w, Term.route] = 2.0 * passed * wp.where(passed > 0.0, lowness, 1.0)
-    result.terms[w, Term.goal] = lowness * (1.0 + wp.max(passed, 0.0)) * (1.0 - wp.tanh(5.0 * distance))
+    result.terms[w, Term.route] = 2.0 * passed
+    result.terms[w, Term.goal] = (1.0 + wp.max(passed, 0.0)) * (1.0 - wp.tanh(5.0 * distance))
     result.terms[w, Term.hold] = wp.where(there, 2.0, 0.0)
     count_held(there, plan.hold_steps, result, w)
