@@ -20,7 +20,6 @@ class WorldState:
     object_velocity: wp.array2d[wp.vec3]  # [m/s]
     tool_pose: wp.array[wp.transform]
     finger_force: wp.array2d[wp.vec3]  # [N]
-    force_limit: wp.array[float]  # of a safe success [N]
     function_start: wp.array[int]
     q: wp.array[wp.vec3d]  # reduced coordinates [m]
     particle_start: wp.array[int]
@@ -87,18 +86,6 @@ def grasped(state: WorldState, world: int):
 def touched(state: WorldState, world: int):
     """Return whether any finger feels an object."""
     return touches(state, world, 0) or touches(state, world, 1)
-
-
-@wp.func
-def care(state: WorldState, world: int):
-    """Return what a grip counts: 1 / (1 + o^2), o the force of the harder finger over a gentle one, relative to it.
-
-    Gentle is up to two thirds of the force limit, 10 N as a rule.
-    """
-    gentle = 2.0 / 3.0 * state.force_limit[world]
-    force = wp.max(wp.length(state.finger_force[world, 0]), wp.length(state.finger_force[world, 1]))
-    over = wp.max(force - gentle, 0.0) / gentle
-    return 1.0 / (1.0 + over * over)
 
 
 @wp.func

@@ -308,7 +308,6 @@ class Task:
         self._high = wp.array(self.high, dtype=float, device=device)
         self.state = filled(
             WorldState,
-            self.handling,
             scene,
             scene.controller,
             scene.model.softmode,

