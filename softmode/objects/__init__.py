@@ -12,10 +12,9 @@ from softmode.lazy import lazy_names
 if TYPE_CHECKING:
     from softmode.objects.config import ObjectConfig, StifferBox
     from softmode.objects.cut import cut_object
-    from softmode.objects.loader import load
+    from softmode.objects.loader import build_object, load
     from softmode.objects.mesh_file import read_mesh
     from softmode.objects.mesh_fit import FitOptions, MeshFit, splats_from_mesh
-    from softmode.objects.object_build import build_object
     from softmode.objects.object_file import surface_cover, write_object
     from softmode.objects.object_set import ObjectSet
     from softmode.objects.paint import StifferColor, color_field, nearest_field, read_field
