@@ -1,7 +1,7 @@
 """Time the splat camera: throughput over worlds, stages and floor, and its peers on the same splats in the same run.
 
-Run from the repository root: ``python -m benchmarks.camera`` (CPU, one core), with ``--peer newton`` for the ray tracer
-of Newton, or ``python -m benchmarks.camera --device cuda:0 --worlds 1 64 256 1024 4096 --peer gsplat``.
+Run from the repository root: ``python -m benchmarks.camera`` (CPU, one core), or ``python -m benchmarks.camera --device
+cuda:0 --worlds 1 64 256 1024 4096 --peer gsplat``.
 
 Every world has its own deformation by 16 handles and its own camera (`camera_scene`); a frame deforms and draws all of
 them. First, pictures of one of three worlds are compared with the splat formula over every splat in float64; pixels
@@ -33,7 +33,6 @@ TOLERANCE = 1e-5
 """Largest error of a colour against the float64 reference."""
 UNDECIDED = 1e-4
 """Relative distance to a threshold below which single precision may decide otherwise."""
-NEWTON_COUNTS = (1_000, 5_000, 10_000, 50_000)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -43,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--sizes", type=int, nargs="+", default=[64, 128], help="image edges [px]")
     parser.add_argument("--worlds", type=int, nargs="+", default=[1, 4, 16])
     parser.add_argument("--splats", type=int, default=5000)
-    parser.add_argument("--peer", choices=("gsplat", "newton", "none"), default="none")
+    parser.add_argument("--peer", choices=("gsplat", "none"), default="none")
     parser.add_argument("--repeats", type=int, default=20)
     parser.add_argument("--no-compile", action="store_true", help="leave torch.compile out")
     options = parser.parse_args(arguments)
@@ -52,12 +51,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     wp.config.log_level = wp.LOG_WARNING
     sound = all([check(size, options.splats, options.device) for size in options.sizes])
     report_throughput(options)
-    if options.peer == "newton":
-        clock = Clock(options.device, options.repeats)
-        from benchmarks.camera_quality import report_quality, report_speed
-
-        report_speed(options.sizes, NEWTON_COUNTS, clock)
-        report_quality(options.sizes, options.splats, clock)
     return 0 if sound else 1
 
 

@@ -1,9 +1,5 @@
-"""Cost of contact between soft bodies: cubes stacked on the ground, resting, per step and world.
+"""Cost of contact between soft bodies: cubes stacked on the ground, resting, per step and world; see `scaling`."""
 
-Run: ``python -m benchmarks.pile [--bodies 3] [--worlds 1] [--device cpu] [--modes 8] [--replays 50]``
-"""
-
-import argparse
 import time
 from typing import Any
 
@@ -76,26 +72,3 @@ def pile(
     assert not solver.status.numpy().any()
     memory = (held(wp.get_device(device)) - before) / world_count
     return float(np.median(times)), float(np.mean(iterations)), memory
-
-
-def main() -> None:
-    """Print one row per number of bodies."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--bodies", type=int, nargs="+", default=[1, 2, 3])
-    parser.add_argument("--worlds", type=int, nargs="+", default=[1])
-    parser.add_argument("--modes", type=int, default=8)
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--replays", type=int, default=50, help="measured replays of two steps")
-    args = parser.parse_args()
-    print("| bodies | worlds | ms per step | Newton iterations | memory per world |\n|---|---|---|---|---|")
-    for world_count in args.worlds:
-        for body_count in args.bodies:
-            milliseconds, iterations, memory = pile(body_count, world_count, args.modes, args.device, args.replays)
-            print(
-                f"| {body_count} | {world_count} | {milliseconds:.2f} | {iterations:.1f} | {memory / 1e3:,.0f} kB |",
-                flush=True,
-            )
-
-
-if __name__ == "__main__":
-    main()

@@ -28,8 +28,7 @@ from softmode.deformables.model.authoring import add_pins, add_reduced_body, reg
 from softmode.deformables.quadrature.quadrature import quadrature_from_box
 from softmode.deformables.reduction.build_body import build_body
 from softmode.deformables.reduction.options import BuildOptions
-from softmode.deformables.solver.evaluate import assemble, gather_gradient, solve
-from softmode.deformables.solver.evaluate import evaluate as evaluate_step
+from softmode.deformables.solver.evaluate import assemble, evaluate, evaluate_trial, gather_gradient
 from softmode.deformables.solver.minimise import accept_step, check_convergence, start_line_search
 from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
 
@@ -134,37 +133,7 @@ class Beam:
 
     def report_stages(self, repeats: int) -> None:
         """Print the time of every stage, each captured on its own."""
-        solver, (state, other), progress = self.solver, self.states, self.solver.tables.newton
-
-        def stage(run: Callable[[], None], *, renewed: bool = False) -> Callable[[], None]:
-            def prepared() -> None:
-                progress.active.fill_(1)
-                progress.refresh.fill_(int(renewed))
-                run()
-
-            return prepared
-
-        def evaluate(derivatives: bool) -> Callable[[], None]:
-            return lambda: evaluate_step(solver.tables, DT, derivatives=derivatives)
-
-        stages = {
-            "two fills (in every row below)": stage(lambda: None),
-            "begin": stage(lambda: solver.begin(state, self.control, DT)),
-            "detect": stage(lambda: solver.detect(state, self.control, DT, prescribed=True)),
-            "evaluate with Hessian": stage(evaluate(True), renewed=True),
-            "evaluate with gradient": stage(evaluate(True)),
-            "evaluate energy": stage(evaluate(False)),
-            "gather gradient": stage(lambda: gather_gradient(solver.tables, DT)),
-            "check convergence": stage(lambda: check_convergence(solver.tables, DT)),
-            "assemble with stiffness": stage(lambda: assemble(solver.tables, DT), renewed=True),
-            "assemble": stage(lambda: assemble(solver.tables, DT)),
-            "factor": stage(lambda: solver.tables.system.factor(progress.active)),
-            "factor and solve": stage(lambda: solve(solver.tables)),
-            "start line search": stage(lambda: start_line_search(solver.tables, DT)),
-            "accept step": stage(lambda: accept_step(solver.tables, DT)),
-            "finish": stage(lambda: solver.finish(other, DT)),
-        }
-        for name, run in stages.items():
+        for name, run in stages(self.solver, *self.states, self.control, DT).items():
             graph = self._capture(run)
             print(f"    {name:<32}{np.median([self._time(graph) for _ in range(repeats)]):8.3f} ms")
 
@@ -191,6 +160,43 @@ class Beam:
     def _memory(self) -> float:
         """Return the bytes in use on a CUDA device; nan on CPU."""
         return float(wp.get_mempool_used_mem_current(self.device)) if self.device.is_cuda else float("nan")
+
+
+def stages(
+    solver: SolverReduced, state: newton.State, other: newton.State, control: newton.Control, dt: float
+) -> dict[str, Callable[[], None]]:
+    """Return the stages of a step from one state to another; all worlds take part in each."""
+    tables, progress = solver.tables, solver.tables.newton
+    rigid = tables.rigid.count_max, tables.rigid.table.direction, tables.rigid.count_max
+
+    def stage(run: Callable[[], object], *, renewed: bool = False) -> Callable[[], None]:
+        def prepared() -> None:
+            progress.active.fill_(1)
+            progress.searching.fill_(1)
+            progress.refresh.fill_(int(renewed))
+            progress.evaluated.zero_()
+            run()
+
+        return prepared
+
+    return {
+        "four fills (in every row below)": stage(lambda: None),
+        "begin": stage(lambda: solver.begin(state, control, dt)),
+        "detect": stage(lambda: solver.detect(state, control, dt, prescribed=True)),
+        "evaluate with Hessian": stage(lambda: evaluate(tables, dt, derivatives=True), renewed=True),
+        "evaluate with gradient": stage(lambda: evaluate(tables, dt, derivatives=True)),
+        "evaluate energy": stage(lambda: evaluate(tables, dt, derivatives=False)),
+        "gather gradient": stage(lambda: gather_gradient(tables, dt)),
+        "check convergence": stage(lambda: check_convergence(tables, dt)),
+        "assemble with stiffness": stage(lambda: assemble(tables, dt), renewed=True),
+        "assemble": stage(lambda: assemble(tables, dt)),
+        "factor": stage(lambda: tables.system.factor(progress.active)),
+        "solve": stage(lambda: tables.system.solve(progress.active, *rigid)),
+        "start line search": stage(lambda: start_line_search(tables, dt)),
+        "evaluate trial": stage(lambda: evaluate_trial(tables, dt)),
+        "accept step": stage(lambda: accept_step(tables, dt)),
+        "finish": stage(lambda: solver.finish(other, dt)),
+    }
 
 
 def product_rate(device: str) -> float:
