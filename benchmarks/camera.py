@@ -24,7 +24,7 @@ import numpy as np
 import warp as wp
 
 from benchmarks.camera_scene import DILATION, SceneCamera, blob, handle_scene, intrinsics, orbit
-from benchmarks.clock import Clock
+from benchmarks.clock import Clock, held
 from benchmarks.step import product_rate
 from softmode.splats.raster.rasterizer_kernels import TILE
 from tests.splats.dense_reference import render_dense
@@ -97,7 +97,7 @@ def report_throughput(options: argparse.Namespace) -> None:
     for size in options.sizes:
         for worlds in options.worlds:
             scene = handle_scene(blob(options.splats), worlds)
-            before = pool_memory(clock.device)
+            before = held(clock.device)
             camera = SceneCamera(scene, size, device=options.device)
             total = clock.replay(camera.frame)
             spent = [clock.replay(run) for run in stages(camera)]
@@ -106,7 +106,7 @@ def report_throughput(options: argparse.Namespace) -> None:
                 f"{size:4d} {worlds:6d} | {total:9.3f} {1e3 * worlds / total:9.0f} |"
                 + "".join(f"{stage:7.2f}" for stage in spent)
                 + f" | {floors[0]:8.3f} {floors[1]:8.3f} {total / max(floors):8.1f} | "
-                f"{(pool_memory(clock.device) - before) / 1e6:.0f} (pool's peak {pool_peak(clock.device) / 1e6:.0f})",
+                f"{(held(clock.device) - before) / 1e6:.0f} (pool's peak {pool_peak(clock.device) / 1e6:.0f})",
                 flush=True,
             )
             picture = camera.rasterizer.rgb.numpy()[0]
@@ -147,11 +147,6 @@ def copy_rate(device: str) -> float:
     size = 2**28 if wp.get_device(device).is_cuda else 2**26
     source, target = (wp.zeros(size, dtype=wp.uint8, device=device) for _ in range(2))
     return 2.0 * size / (1e-3 * Clock(device, 10).median(lambda: wp.copy(target, source)))
-
-
-def pool_memory(device: wp.Device) -> int:
-    """Return the bytes in use in a CUDA device's pool; 0 on CPU."""
-    return int(wp.get_mempool_used_mem_current(device)) if device.is_cuda else 0
 
 
 def pool_peak(device: wp.Device) -> int:

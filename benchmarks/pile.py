@@ -1,13 +1,12 @@
 """Cost of contact between soft bodies: cubes stacked on the ground, resting, per step and world; see `scaling`."""
 
-import time
 from typing import Any
 
 import newton
 import numpy as np
 import warp as wp
 
-from benchmarks.clock import held
+from benchmarks.clock import Clock, held, replayed
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body, register_custom_attributes
 from softmode.deformables.quadrature.quadrature import quadrature_from_box
@@ -54,21 +53,12 @@ def pile(
         solver.step(first, second, None, None, DT)
         solver.step(second, first, None, None, DT)
 
-    two_steps()
-    with wp.ScopedCapture(device=device) as capture:
-        two_steps()
-    graph: Any = capture.graph
-    clock = time.process_time if device == "cpu" else time.perf_counter
+    play, clock = replayed(two_steps, wp.get_device(device)), Clock(device, replays)
+    play(min(SETTLING, 2 * replays))
     times, iterations = [], []
-    settling = min(SETTLING, 2 * replays)
-    for k in range(settling + replays):
-        wp.synchronize_device(device)
-        start = clock()
-        wp.capture_launch(graph)
-        wp.synchronize_device(device)
-        if k >= settling:
-            times.append(0.5e3 * (clock() - start))
-            iterations.append(solver.iteration.numpy().mean())
+    for _ in range(replays):
+        times.append(0.5 * clock.once(lambda: play(1)))
+        iterations.append(solver.iteration.numpy().mean())
     assert not solver.status.numpy().any()
     memory = (held(wp.get_device(device)) - before) / world_count
     return float(np.median(times)), float(np.mean(iterations)), memory

@@ -21,6 +21,7 @@ import newton
 import numpy as np
 import warp as wp
 
+from benchmarks.clock import Clock, held, replayed
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.materials.material import Material
 from softmode.deformables.materials.material_kernels import MaterialModel
@@ -100,7 +101,7 @@ class Beam:
         builder = newton.ModelBuilder()
         register_custom_attributes(builder)
         builder.replicate(world, world_count)
-        before = self._memory()
+        before = held(self.device)
         model = builder.finalize(device=device)
         model.set_gravity((0.0, 0.0, -9.81))
         self.solver = SolverReduced(model, [body], options=SolverReducedOptions(contact_max=1))
@@ -108,16 +109,15 @@ class Beam:
             self.solver.tables = dataclasses.replace(self.solver.tables, tiled=False)
         self.states = model.state(), model.state()
         self.control = model.control()
-        self.memory = self._memory() - before
-        self.graph = self._capture(self._two_steps)
-        for _ in range(20):
-            wp.capture_launch(self.graph)
+        self.memory = held(self.device) - before
+        self.play = replayed(self._two_steps, self.device)
+        self.play(20)
 
     def report(self, repeats: int, rate: float) -> None:
         """Print one row."""
-        times, iterations = [], []
+        times, iterations, clock = [], [], Clock(self.device, repeats)
         for _ in range(repeats):
-            times.append(0.5 * self._time(self.graph))
+            times.append(0.5 * clock.once(lambda: self.play(1)))
             iterations.append(self.solver.iteration.numpy().max())
         n, points = self.body.function_count, self.body.point_count
         flops = 27.0 * n**2 * points + (3 * n) ** 3 / 3.0
@@ -134,32 +134,12 @@ class Beam:
     def report_stages(self, repeats: int) -> None:
         """Print the time of every stage, each captured on its own."""
         for name, run in stages(self.solver, *self.states, self.control, DT).items():
-            graph = self._capture(run)
-            print(f"    {name:<32}{np.median([self._time(graph) for _ in range(repeats)]):8.3f} ms")
+            print(f"    {name:<32}{Clock(self.device, repeats).replay(run):8.3f} ms")
 
     def _two_steps(self) -> None:
         first, second = self.states
         self.solver.step(first, second, self.control, None, DT)
         self.solver.step(second, first, self.control, None, DT)
-
-    def _capture(self, run: Callable[[], None]) -> Any:
-        run()
-        with wp.ScopedCapture(device=self.device) as capture:
-            run()
-        return capture.graph
-
-    def _time(self, graph: Any) -> float:
-        """Return the time of one replay [ms]."""
-        clock = time.perf_counter if self.device.is_cuda else time.process_time  # of this process: one core
-        wp.synchronize_device(self.device)
-        start = clock()
-        wp.capture_launch(graph)
-        wp.synchronize_device(self.device)
-        return 1e3 * (clock() - start)
-
-    def _memory(self) -> float:
-        """Return the bytes in use on a CUDA device; nan on CPU."""
-        return float(wp.get_mempool_used_mem_current(self.device)) if self.device.is_cuda else float("nan")
 
 
 def stages(
@@ -240,14 +220,7 @@ def report_torch(body: ReducedBody, system_count: int, repeats: int) -> None:
             torch.bmm(left, right, out=block)
 
     def timed(run: Callable[[], Any]) -> float:
-        times = []
-        for _ in range(max(repeats // 5, 3)):
-            torch.cuda.synchronize()
-            start = time.perf_counter()
-            run()
-            torch.cuda.synchronize()
-            times.append(1e3 * (time.perf_counter() - start))
-        return float(np.median(times))
+        return Clock("cuda", max(repeats // 5, 3)).median(lambda: (run(), torch.cuda.synchronize()))
 
     print(
         f"    torch: six batched products {timed(assemble):.3f} ms, "
