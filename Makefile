@@ -117,7 +117,7 @@ $(VENV)/.bench: $(VENV)/.dev
 
 accuracy: $(VENV)/.bench  ## the tables and the picture of docs/accuracy.md
 	$(BIN)/python -m benchmarks.accuracy $(ARGS)
-	$(BIN)/python -m benchmarks.accuracy_picture
+	$(BIN)/python docs/accuracy_picture.py
 
 baselines: $(VENV)/.bench  ## the table and the picture of docs/baselines.md
 	$(BIN)/python -m benchmarks.baselines.run --picture docs/images/baselines.png $(ARGS)

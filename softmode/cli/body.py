@@ -242,8 +242,7 @@ def _examined(options: _Asset) -> tuple[SoftObject, BodyReport]:
     from softmode.deformables.reduction.options import BuildOptions
     from softmode.deformables.reduction.report import report_body
     from softmode.objects.config import ObjectConfig
-    from softmode.objects.loader import load
-    from softmode.objects.object_build import build_object
+    from softmode.objects.loader import build_object, load
     from softmode.objects.object_file import file_kind, stored_material
 
     options.toy.check()

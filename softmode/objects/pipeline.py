@@ -1,7 +1,4 @@
-"""One line of stages from what an object is made of to the object: it stands, is reduced, and gets its splats.
-
-`load` and `build_object` are its entrances: :func:`softmode.objects.source.object_source` reads, what follows is here.
-"""
+"""Stages of :func:`softmode.objects.loader.load`: an object stands, is reduced, and gets its splats."""
 
 from __future__ import annotations
 

@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from softmode.deformables.quadrature.occupancy import Occupancy, fill_splats
-from softmode.errors import AssetError, ConfigError, needs_extra
-from softmode.files import whole_file
+from softmode.errors import AssetError
 from softmode.objects.config import ObjectConfig
 from softmode.objects.source import object_source
 from softmode.splats.components import split_components
 from softmode.splats.raster.pinhole import PinholeCamera
 from softmode.splats.raster.rasterizer import SplatArrays, SplatRasterizer, ViewArrays
 from softmode.splats.splats import SH_DC, Splats
+from softmode.viz.figure_file import figure_file
 
 Array = NDArray[np.float64]
 
@@ -93,37 +92,24 @@ def write_splat_sheet(path: str | os.PathLike[str], survey: SplatSurvey, *, titl
         ConfigError: If the name is not that of a .png.
         StorageError: If it cannot be written.
     """
-    with needs_extra("viz", "a sheet of a capture needs matplotlib"):
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    target = Path(path)
-    if target.suffix.lower() != ".png":
-        raise ConfigError(f"sheet {target} is no .png file", hint="name it like toy.png")
     splats, kept = survey.splats, survey.kept
     tinted = splats.sh[:, :1].copy()
     tinted[~kept] = 0.35 * tinted[~kept] + 0.65 * (np.array(CUT) - 0.5) / SH_DC
     marked = replace(splats, sh=tinted)
     thing = splats.subset(kept)
-    figure = Figure(figsize=(16.0, 8.9), dpi=100, facecolor="white")
-    canvas = FigureCanvasAgg(figure)
-    figure.text(0.015, 0.965, title, fontsize=15, weight="bold")
-    grid = figure.add_gridspec(2, 4, left=0.03, right=0.985, top=0.915, bottom=0.05, wspace=0.2, hspace=0.2)
-    for k, (name, (toward, right, up)) in enumerate(VIEWS.items()):
-        draw_view(figure.add_subplot(grid[0, k]), name, splats, np.array(toward), right, up)
-    corner = np.array(VIEWS["from the corner"][0])
-    cut = f"red is cut: {np.count_nonzero(~kept)} of {splats.count} splats"
-    draw_view(figure.add_subplot(grid[1, 0]), cut, marked, corner, "", "")
-    draw_view(figure.add_subplot(grid[1, 1]), "what is taken", thing, corner, "", "")
-    _draw_fill(figure.add_subplot(grid[1, 2]), survey, thing)
-    words = figure.add_subplot(grid[1, 3])
-    words.set_axis_off()
-    words.text(0.0, 1.0, "\n".join([*notes, *_told(survey)]), va="top", fontsize=9.5, linespacing=1.5, wrap=True)
-    canvas.draw()
-    from PIL import Image
-
-    picture = Image.fromarray(np.asarray(canvas.buffer_rgba())[:, :, :3])
-    with whole_file(target, "sheet") as file:
-        picture.save(file, format="png", optimize=True)
+    with figure_file(path, (16.0, 8.9), what="sheet", whole="a sheet of a capture", like="toy.png") as figure:
+        figure.text(0.015, 0.965, title, fontsize=15, weight="bold")
+        grid = figure.add_gridspec(2, 4, left=0.03, right=0.985, top=0.915, bottom=0.05, wspace=0.2, hspace=0.2)
+        for k, (name, (toward, right, up)) in enumerate(VIEWS.items()):
+            draw_view(figure.add_subplot(grid[0, k]), name, splats, np.array(toward), right, up)
+        corner = np.array(VIEWS["from the corner"][0])
+        cut = f"red is cut: {np.count_nonzero(~kept)} of {splats.count} splats"
+        draw_view(figure.add_subplot(grid[1, 0]), cut, marked, corner, "", "")
+        draw_view(figure.add_subplot(grid[1, 1]), "what is taken", thing, corner, "", "")
+        _draw_fill(figure.add_subplot(grid[1, 2]), survey, thing)
+        words = figure.add_subplot(grid[1, 3])
+        words.set_axis_off()
+        words.text(0.0, 1.0, "\n".join([*notes, *_told(survey)]), va="top", fontsize=9.5, linespacing=1.5, wrap=True)
 
 
 def _told(survey: SplatSurvey) -> list[str]:
