@@ -11,10 +11,11 @@ from softmode.lazy import lazy_names
 
 if TYPE_CHECKING:
     from softmode.mpm.grid import Grid
-    from softmode.mpm.losses import CoarseMassLoss, MassLoss, position_loss
+    from softmode.mpm.losses import MassLoss, position_loss
     from softmode.mpm.morphing import morph
     from softmode.mpm.options import MpmOptions
     from softmode.mpm.particles import ParticleBody, particles_from_body, particles_from_mesh, particles_from_shape
+    from softmode.mpm.places import PlaceLoss
     from softmode.mpm.planner import MORPH_MATERIAL, MorphOptions, MorphPlanner
     from softmode.mpm.replaying import ReplayFrame, replay
     from softmode.mpm.run import MorphRun
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "MORPH_MATERIAL",
-    "CoarseMassLoss",
     "Grid",
     "GridShapes",
     "MassLoss",
@@ -35,6 +35,7 @@ __all__ = [
     "ParameterBars",
     "ParticleBody",
     "ParticleState",
+    "PlaceLoss",
     "ReplayFrame",
     "morph",
     "particles_from_body",
