@@ -11,7 +11,6 @@ from softmode.lazy import lazy_names
 
 if TYPE_CHECKING:
     from softmode.mpm.grid import Grid as Grid
-    from softmode.mpm.losses import CoarseMassLoss as CoarseMassLoss
     from softmode.mpm.losses import MassLoss as MassLoss
     from softmode.mpm.losses import position_loss as position_loss
     from softmode.mpm.morphing import morph as morph
@@ -20,6 +19,7 @@ if TYPE_CHECKING:
     from softmode.mpm.particles import particles_from_body as particles_from_body
     from softmode.mpm.particles import particles_from_mesh as particles_from_mesh
     from softmode.mpm.particles import particles_from_shape as particles_from_shape
+    from softmode.mpm.places import PlaceLoss as PlaceLoss
     from softmode.mpm.planner import MORPH_MATERIAL as MORPH_MATERIAL
     from softmode.mpm.planner import MorphOptions as MorphOptions
     from softmode.mpm.planner import MorphPlanner as MorphPlanner
