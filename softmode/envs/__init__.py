@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from softmode.envs.observation import Segment
     from softmode.envs.parameters import Parameter
     from softmode.envs.presets import rl_scene
-    from softmode.envs.reward_kernels import WorldState
+    from softmode.envs.reward_kernels import StepResult, WorldState, count_held, surface_point, tool_position, write
     from softmode.envs.scripted import scripted_policy, scripted_worlds
     from softmode.envs.scripted_base import ScriptedPolicy
     from softmode.envs.soft_env import SoftEnv
@@ -42,26 +42,12 @@ if TYPE_CHECKING:
     from softmode.envs.tasks.rope_route.task import RopeRoute, RopeRouteConfig, RopeRouteEnv, RopeRouteVectorEnv
     from softmode.envs.tasks.shape_soft.config import ShapeSoftConfig
     from softmode.envs.tasks.shape_soft.task import ShapeSoft, ShapeSoftEnv, ShapeSoftVectorEnv
-    from softmode.envs.term_task import TermTask
-    from softmode.envs.terms import (
-        CurriculumTerm,
-        EventTerm,
-        MetricTerm,
-        ObservationTerm,
-        RewardTerm,
-        SuccessTerm,
-        TermConfig,
-        TerminationTerm,
-        Terms,
-    )
     from softmode.envs.throughput import measure_throughput
     from softmode.vector_check import VectorEnvReport, check_vector_env
 
 __all__ = [
-    "CurriculumTerm",
     "EndReason",
     "EnvState",
-    "EventTerm",
     "LiftSoft",
     "LiftSoftConfig",
     "LiftSoftEnv",
@@ -70,8 +56,6 @@ __all__ = [
     "LiftSoftGoalEnv",
     "LiftSoftGoalVectorEnv",
     "LiftSoftVectorEnv",
-    "MetricTerm",
-    "ObservationTerm",
     "Parameter",
     "PlaceInBin",
     "PlaceInBinConfig",
@@ -89,7 +73,6 @@ __all__ = [
     "PushSoftGoalEnv",
     "PushSoftGoalVectorEnv",
     "PushSoftVectorEnv",
-    "RewardTerm",
     "RopeRoute",
     "RopeRouteConfig",
     "RopeRouteEnv",
@@ -105,20 +88,20 @@ __all__ = [
     "SoftEnv",
     "SoftVectorEnv",
     "StableBaselinesVecEnv",
-    "SuccessTerm",
+    "StepResult",
     "Task",
     "TaskConfig",
-    "TermConfig",
-    "TermTask",
-    "TerminationTerm",
-    "Terms",
     "VectorEnvReport",
     "WorldState",
     "check_vector_env",
+    "count_held",
     "measure_throughput",
     "rl_scene",
     "scripted_policy",
     "scripted_worlds",
+    "surface_point",
+    "tool_position",
+    "write",
 ]
 
 __getattr__, __dir__ = lazy_names(__name__)

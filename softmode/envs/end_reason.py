@@ -18,4 +18,4 @@ class EndReason(IntEnum):
     SPILLED = 4
     """Another object left the container that it belongs in."""
     FAILED = 5
-    """A rule of the task itself, of a `TerminationTerm`."""
+    """A rule of the task itself was broken: its `evaluate` wrote so."""

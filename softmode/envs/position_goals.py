@@ -46,11 +46,6 @@ class PositionGoals(Task):
             *super().object_segments(),
         )
 
-    def state_keys(self) -> dict[str, slice]:
-        """Return the columns of observation and goals."""
-        goals = {name: self.segments[name][0] for name in ("achieved_goal", "desired_goal")}
-        return {"observation": slice(self.column("object_position"), self.column("achieved_goal")), **goals}
-
     def build(self) -> None:
         """Find the columns."""
         super().build()

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, cast
 
+import gymnasium as gym
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from softmode.deformables.model.status import status_reasons
 from softmode.envs.task import Task
@@ -17,21 +19,40 @@ Tree = wp.array | np.ndarray | dict[str, "Tree"] | list["Tree"]
 
 
 def observation_arrays(task: Task, *, final: bool = False) -> Tree:
-    """Return the observation of all worlds in the structure of `Task.observation_space`; `final`: before the reset."""
-    vector = task.final_observation if final else task.observation
+    """Return the observation of all worlds in the structure of its space; `final`: before the reset."""
+    vector = (task.final_outcome if final else task.outcome)["observation"]
     if task.obs_type == "state":
-        keys = task.state_keys()
+        keys = task.layout.keys
         return {name: columns_of(vector, columns) for name, columns in keys.items()} if keys else vector
-    images: dict[str, Tree] = dict(task.final_images if final else task.images)
+    images: dict[str, Tree] = dict(task.pictures.final_images if final else task.pictures.images)
     if task.obs_type == "pixels_agent_pos":
-        images["agent_pos"] = columns_of(vector, slice(task.agent_size))
+        images["agent_pos"] = columns_of(vector, slice(task.layout.agent_size))
     return images["pixels"] if list(images) == ["pixels"] else images
+
+
+def spaces_of(task: Task) -> tuple[gym.spaces.Box, gym.Space]:
+    """Return the spaces of one world's actions, in [-1, 1], and of its observation, with finite bounds."""
+    actions = gym.spaces.Box(-1.0, 1.0, (task.scene.controller.action_size,), np.float32)
+    layout = task.layout
+    if task.obs_type == "state":
+        keys = {name: layout.space(columns) for name, columns in layout.keys.items()}
+        return actions, gym.spaces.Dict(keys) if keys else layout.space(slice(0, len(layout.low)))
+    spaces = task.pictures.spaces()
+    if task.obs_type == "pixels_agent_pos":
+        spaces["agent_pos"] = layout.space(slice(0, layout.agent_size))
+    return actions, spaces["pixels"] if list(spaces) == ["pixels"] else gym.spaces.Dict(spaces)
+
+
+def film_of(task: Task) -> NDArray[np.uint8]:
+    """Return a frame per world: the pictures of the film cameras side by side."""
+    scale = task.table.values.numpy()[:, task.table.column("scale")]
+    return task.pictures.draw_film(scale, task.episodes.elapsed.numpy() / task.config.scene.control_hz)
 
 
 def info_arrays(task: Task, *, final: bool = False) -> dict[str, Tree]:
     """Return the infos of all worlds; with `final`, those of the episodes that ended in this step."""
     success, metrics, parameters, vector, status, index = (task.final_outcome if final else task.outcome).values()
-    which = {} if task.object_set is None else {"object": index}
+    which = {} if task.config.object_set is None else {"object": index}
     return {
         **which,
         "is_success": success,
@@ -44,7 +65,7 @@ def info_arrays(task: Task, *, final: bool = False) -> dict[str, Tree]:
         },
         "finger_force": columns_of(vector, task.segments["finger_force"][0]),
         "solver_status": status,
-        "end_reason": task.end,
+        "end_reason": task.episodes.end,
     }
 
 

@@ -27,7 +27,7 @@ class WorldState:
     points: wp.array2d[int]  # those of object 0 that are observed, (world_count, points)
     stride: int  # soft objects per world
     slots: int  # of them those of a set, the first ones
-    occupant: wp.array[int]  # (world_count * slots,) which object of the set that is, -1 for none
+    choice: wp.array[int]  # (world_count * slots,) which object of the set that is, -1 for none
 
 
 @wp.struct
@@ -67,7 +67,7 @@ def is_there(state: WorldState, world: int, o: int):
     """Return whether a world has its object o."""
     if o >= state.slots:
         return True
-    return state.occupant[world * state.slots + o] >= 0
+    return state.choice[world * state.slots + o] >= 0
 
 
 @wp.func

@@ -78,7 +78,7 @@ class ScriptedWorlds:
 
     def __call__(self, observation: object = None) -> NDArray[np.float32]:
         """Return the actions for the present state, shape (num_envs, action_size)."""
-        for policy, elapsed in zip(self._policies, self._task.elapsed.numpy(), strict=True):
+        for policy, elapsed in zip(self._policies, self._task.episodes.elapsed.numpy(), strict=True):
             if elapsed == 0:
                 policy.reset()
         return np.stack([policy() for policy in self._policies])

@@ -74,12 +74,12 @@ class ScriptedPolicy:
     @property
     def soft(self) -> SoftObject:
         """The object that it is about."""
-        return self.scene.objects_of(self.world)[self._order[0]]
+        return self.scene.occupancy.objects_of(self.world)[self._order[0]]
 
     @property
     def _order(self) -> list[int]:
-        """The objects that are there by their places in `TableScene.objects_of`, the one that it is about first."""
-        there = self.scene.instances_of(self.world)
+        """The objects that are there by their places in `Occupancy.objects_of`, the one that it is about first."""
+        there = self.scene.occupancy.instances_of(self.world)
         first = there.index(self.world * self.task.state.stride + self.target)
         return [first, *(k for k in range(len(there)) if k != first)]
 
@@ -108,12 +108,12 @@ class ScriptedPolicy:
 
     def material(self, name: str) -> float:
         """Return a property of the object: of its material, or its scale."""
-        return float(self.task.materials[name].numpy()[self.world * self.task.state.stride + self.target])
+        return float(self.task.materials.values[name].numpy()[self.world * self.task.state.stride + self.target])
 
     def surfaces(self) -> list[Vector]:
         """Return the surface samples of every object that is there [m], each of shape (N, 3), the object's first."""
-        starts = self.task.state.particle_start.numpy()[list(self.scene.instances_of(self.world))]
-        points, things = self.scene.state.particle_q.numpy(), self.scene.objects_of(self.world)
+        starts = self.task.state.particle_start.numpy()[list(self.scene.occupancy.instances_of(self.world))]
+        points, things = self.scene.state.particle_q.numpy(), self.scene.occupancy.objects_of(self.world)
         return [points[starts[k] : starts[k] + things[k].body.surface_count].astype(float) for k in self._order]
 
     # -- acting -------------------------------------------------------------------------------------------------------

@@ -33,7 +33,16 @@ from softmode.envs.env_state import (
     worlds_state,
 )
 from softmode.envs.parameters import check_options
-from softmode.envs.results import host_view, info_arrays, name_of, observation_arrays, take, write
+from softmode.envs.results import (
+    film_of,
+    host_view,
+    info_arrays,
+    name_of,
+    observation_arrays,
+    spaces_of,
+    take,
+    write,
+)
 from softmode.envs.robots import Robot
 from softmode.envs.task import Task
 from softmode.envs.task_config import ObservationType, TaskConfig
@@ -140,11 +149,10 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
         self._begun = False
         """Whether an episode has begun."""
         self._object_names = () if self.config.object_set is None else self.config.object_set.names
-        self.action_space = self.task.action_space
-        self.observation_space = self.task.observation_space()
         task = self.task
-        made = (task.scene.actions, observation_arrays(task), info_arrays(task))
-        self._arrays = map_tree(host_view, (*made, task.reward, task.terminated, task.truncated))
+        self.action_space, self.observation_space = spaces_of(task)
+        ends, made = task.episodes, (task.scene.actions, observation_arrays(task), info_arrays(task))
+        self._arrays = map_tree(host_view, (*made, ends.reward, ends.terminated, ends.truncated))
         """Actions, observation, infos, reward and ends of the last step: always the same memory."""
 
     def reset(self, *, seed: int | None = None, options: Mapping[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -157,9 +165,9 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
                     "a state excludes a seed and other options, it brings its own", hint="give the state alone"
                 )
             self.set_state(checked_state(given["state"]))
-            self.task.begin()
+            self.task.episodes.begin()
             return self._observe(), self._info()
-        given = check_options(self.task.reset_options, given, 1)
+        given = check_options(self.task.table.options, given, 1)
         fresh = seed is not None or self._np_random is None
         super().reset(seed=seed)
         seeds = np.array([world_seed(self.np_random)]) if fresh else None
@@ -232,7 +240,7 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
         """Return the views of the rendering cameras side by side, uint8 (render_size, 2 render_size, 3)."""
         if self.render_mode is None:
             return None
-        return self.task.draw_film()[0]
+        return film_of(self.task)[0]
 
     def _observe(self) -> Any:
         """Return the observation in arrays of its own."""

@@ -188,17 +188,13 @@ def stage_times(task: Task, repeats: int = 20) -> dict[str, float]:
     """
     scene = task.scene
 
-    def judging() -> None:
-        task.write_observation()
-        task.finish(task.never)
-
     parts: dict[str, Callable[[], None]] = {
         "physics": scene.control_step,
-        "observe and judge": judging,
-        "masked reset": lambda: task.restart(task.never),
+        "observe and judge": lambda: task.judge(task.episodes.never),
+        "masked reset": lambda: task.restart(task.episodes.never),
     }
-    if task.images:
-        parts["camera"] = task.draw_pictures
+    if task.pictures.images:
+        parts["camera"] = task.pictures.draw
     graphs = {"whole step": task.graph}
     graphs |= {name: capture_graph(part, task.device) for name, part in parts.items()}
     spent: dict[str, list[float]] = {name: [] for name in graphs}

@@ -18,7 +18,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from softmode.envs.env_state import set_worlds_state, worlds_state
-from softmode.envs.results import host_view, info_arrays, observation_arrays, write
+from softmode.envs.results import film_of, host_view, info_arrays, observation_arrays, spaces_of, write
 from softmode.envs.task import Task
 from softmode.errors import SoftmodeError, WorkerError
 from softmode.pause import collector_paused
@@ -42,10 +42,9 @@ class LocalWorlds:
             self.task = task_class(**arguments)
         self._result: dict[str, Any] | None = None
         self._actions = host_view(self.task.scene.actions)
-        self.parameters = self.task.reset_options
+        self.parameters = self.task.table.options
         self.segments = {name: columns for name, (columns, _) in self.task.segments.items()}
-        self.action_space = self.task.action_space
-        self.observation_space = self.task.observation_space()
+        self.action_space, self.observation_space = spaces_of(self.task)
 
     def connect(self) -> None:
         """Do nothing: the task is built."""
@@ -63,10 +62,10 @@ class LocalWorlds:
     def set_state(
         self, owner: dict[str, str], arrays: dict[str, NDArray[Any]], mask: NDArray[np.bool_], begin: bool
     ) -> None:
-        """Give the masked worlds a state; `begin` lets episodes begin there, see :meth:`Task.begin`."""
+        """Give the masked worlds a state; `begin` lets episodes begin there, see :meth:`Episodes.begin`."""
         set_worlds_state(self.task, owner, arrays, mask)
         if begin:
-            self.task.begin(mask)
+            self.task.episodes.begin(mask)
 
     def step(self, actions: NDArray[np.float32] | None) -> None:
         """Advance all worlds; None takes the actions that are on the device already."""
@@ -82,9 +81,9 @@ class LocalWorlds:
         made = {
             "observation": observation_arrays(task),
             "state": task.observation,
-            "reward": task.reward,
-            "terminated": task.terminated,
-            "truncated": task.truncated,
+            "reward": task.episodes.reward,
+            "terminated": task.episodes.terminated,
+            "truncated": task.episodes.truncated,
             "info": info_arrays(task),
         }
         self._result = result = map_tree(host_view, made)
@@ -96,7 +95,7 @@ class LocalWorlds:
 
     def render(self) -> NDArray[np.uint8]:
         """Return a frame per world."""
-        return self.task.draw_film()
+        return film_of(self.task)
 
     def close(self) -> None:
         """Do nothing."""

@@ -339,12 +339,12 @@ def test_numbers_beyond_the_bounds_are_clipped(lift: LiftSoftEnv) -> None:
     wild = np.full(task.observation.shape, np.nan, np.float32)
     wild[0, ::2] = 1.0e30
     wild[0, 1] = -np.inf
-    low, high = (wp.array(bound, dtype=float) for bound in (task.low, task.high))
+    low, high = (wp.array(bound, dtype=float) for bound in (task.layout.low, task.layout.high))
     seen, finite = wp.array(wild, dtype=float), wp.zeros(1, dtype=wp.bool)
     wp.launch(bound_observation, dim=1, inputs=[low, high], outputs=[seen, finite])
     assert lift.observation_space.contains(seen.numpy()[0]) and not finite.numpy()[0]
-    np.testing.assert_array_equal(seen.numpy()[0, 1::2], np.clip(0.0, task.low, task.high)[1::2])
-    np.testing.assert_array_equal(seen.numpy()[0, ::2], task.high[::2])
+    np.testing.assert_array_equal(seen.numpy()[0, 1::2], np.clip(0.0, task.layout.low, task.layout.high)[1::2])
+    np.testing.assert_array_equal(seen.numpy()[0, ::2], task.layout.high[::2])
 
 
 @pytest.mark.parametrize("modulus", [2.0e4, 2.0e6])

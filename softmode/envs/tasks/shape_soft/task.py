@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.body.rkpm import sample_farthest
 from softmode.deformables.model.structs import filled
-from softmode.envs.markers import dots
+from softmode.envs.markers import dots, marker_per_object
 from softmode.envs.observation import PROPRIOCEPTION, Segment
 from softmode.envs.parameters import Parameter
 from softmode.envs.soft_env import SoftEnv
@@ -44,7 +44,7 @@ class ShapeSoft(Task):
 
     config: ShapeSoftConfig
     config_class = ShapeSoftConfig
-    kernels = kernels
+    step_kernels = (kernels.observe, kernels.evaluate)
     takes_sets = True
     term_names = tuple(kernels.Term.__members__)
     metric_names = tuple(kernels.Metric.__members__)
@@ -53,11 +53,11 @@ class ShapeSoft(Task):
     def build(self) -> None:
         """Record the targets."""
         scene = self.scene
-        members = range(len(scene.members))
-        presses = [self._record(m) for m in members]
+        choices = range(len(scene.occupancy.choices))
+        presses = [self._record(c) for c in choices]
         rests = [body.surface_points[chosen] for body, _, chosen in presses]
         self.goal_rests = tuple(rests)
-        """Rest points of the targets in the frame of their body [m], one of shape (points, 3) per member."""
+        """Rest points of the targets in the frame of their body [m], one of shape (points, 3) per choice."""
         if scene.splats is not None:  # the marker shows the whole surface
             rests = [
                 np.concatenate([rest, body.surface_points]) for rest, (body, *_) in zip(rests, presses, strict=True)
@@ -66,31 +66,33 @@ class ShapeSoft(Task):
             scene.marker_points = wp.zeros(shape, dtype=wp.vec3, device=self.device)
         pressed = [(body, press, rest) for (body, press, _), rest in zip(presses, rests, strict=True)]
         self.targets = ShapeTargets.from_presses(pressed, self.device)
-        self.target = filled(kernels.Target, self.targets, member=self.per_object(np.array(members), int))
+        self.target = filled(kernels.Target, self.targets, choice=scene.occupancy.follow(choices, int))
         self.rules = reward_rules(self.config)
         self.arm_size = self.segments["arm"][1].size
 
-    def _record(self, member: int) -> tuple[ReducedBody, Press, NDArray[np.intp]]:
-        """Press what makes the targets of a member of the scene; return its body, the press and the points chosen.
+    def _record(self, choice: int) -> tuple[ReducedBody, Press, NDArray[np.intp]]:
+        """Press what makes the targets of a choice of the scene; return its body, the press and the points chosen.
 
         Raises:
             ConfigError: If the arm does not bend it far enough; it names the object of a set.
         """
         scene, goal = self.scene, self.config.goal_object
-        if self.object_set is not None or goal is not None:  # on its own, so that a target depends on its object alone
+        if self.config.object_set is not None or goal is not None:  # so that a target depends on its object alone
             alone = replace(
                 self.scene_config(),
-                object=goal or scene.members[member].config,
+                object=goal or scene.occupancy.choices[choice].config,
                 objects=None,
-                material=scene.materials[member],
+                material=scene.occupancy.materials[choice],
             )
             scene = TableScene(alone, device=self.device)
         body = scene.soft.body
-        points = self._points[member] if goal is None else sample_farthest(body.surface_points, POINTS, first=0)
+        points = self.points_of_choices[choice]
+        if goal is not None:
+            points = sample_farthest(body.surface_points, POINTS, first=0)
         try:
             return body, record_press(scene, self.config.goal_displacement[1]), points
         except ConfigError as error:
-            raise ConfigError(f"{self.member_names[member]}: {error.message}", hint=error.hint) from error
+            raise ConfigError(f"{self.scene.occupancy.names[choice]}: {error.message}", hint=error.hint) from error
 
     def parameters(self) -> tuple[Parameter, ...]:
         """Add the goal: displacement of the free end [m] and direction [rad]."""
@@ -111,11 +113,6 @@ class ShapeSoft(Task):
             Segment("achieved_goal", 3 * self.point_count, -2.0, 2.0),
         )
 
-    def state_keys(self) -> dict[str, slice]:
-        """Return the columns of observation and goals."""
-        goals = {name: self.segments[name][0] for name in ("achieved_goal", "desired_goal")}
-        return {"observation": slice(self.column("object_position"), self.column("achieved_goal")), **goals}
-
     def observe(self) -> None:
         """Write both goals and the error."""
         shape = (self.world_count, self.point_count)
@@ -130,7 +127,7 @@ class ShapeSoft(Task):
         goal = self.config.goal_object
         if goal is not None:
             return _surface(load(goal, material=self.config.scene.material))
-        return self.marker_per_object(_surface)
+        return marker_per_object(self.scene_config(), self.world_count, _surface)
 
 
 def _surface(thing: SoftObject) -> Splats:
