@@ -81,8 +81,14 @@ class Topple(Task):
         return (Segment("upright", 1, -2.0, 3.0),)
 
 
-ToppleEnv = type("ToppleEnv", (SoftEnv,), {"task_class": Topple})
-ToppleVectorEnv = type("ToppleVectorEnv", (SoftVectorEnv,), {"task_class": Topple})
+class ToppleEnv(SoftEnv[Topple]):
+    """One world."""
+
+
+class ToppleVectorEnv(SoftVectorEnv[Topple]):
+    """Many worlds."""
+
+
 gym.register("Topple-v0", entry_point=ToppleEnv, vector_entry_point=ToppleVectorEnv, max_episode_steps=90)
 # ----------------------------------------------------------------------------------------------------------------------
 

@@ -35,11 +35,11 @@ class _GoalMethod:
 class GoalMethods:
     """Reward and ends of episodes as functions of the goals; only with state observations, which hold them.
 
-    A subclass names `goal_size` and launches the kernel of the reward.
+    A subclass launches the kernel of the reward; its task has `goal_size`, the numbers of a goal.
     """
 
-    goal_size: ClassVar[int]
-    """Numbers of a goal."""
+    task_class: ClassVar[Any]
+    """The task."""
     device: wp.Device
     """Device on which rewards of numpy arrays are computed: that of the task."""
 
@@ -58,7 +58,7 @@ class GoalMethods:
         Raises:
             ConfigError: If the shapes do not fit.
         """
-        size = self.goal_size
+        size = self.task_class.goal_size
         pair: tuple[Any, ...] = (achieved_goal, desired_goal)
         if not all(isinstance(goal, Tensor) for goal in pair):
             pair = tuple(np.asarray(goal, np.float32) for goal in pair)

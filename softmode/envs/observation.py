@@ -57,6 +57,21 @@ def proprioception(joint_count: int) -> tuple[Segment, ...]:
     return tuple(replace(s, size=joint_count) if s.name == "joint_angles" else s for s in PROPRIOCEPTION)
 
 
+def goal_part(joint_count: int, size: int) -> tuple[Segment, ...]:
+    """Return the segments of a task with goals: proprioception again, and what was reached, ``achieved_goal``.
+
+    With a ``desired_goal`` beside it a state observation is a dict, see `ObservationTable.keys`. The task writes both.
+
+    Args:
+        joint_count: Joints between base and tool.
+        size: Numbers of a goal.
+    """
+    bounds = [segment.bounds() for segment in proprioception(joint_count)]
+    low, high = (np.concatenate(part) for part in zip(*bounds, strict=True))
+    arm = Segment("arm", len(low), tuple(low.tolist()), tuple(high.tolist()))
+    return (arm, Segment("achieved_goal", size, -2.0, 2.0))
+
+
 def object_part(point_count: int) -> tuple[Segment, ...]:
     """Return the segments of object 0 that every state observation has.
 
@@ -126,7 +141,9 @@ class ObservationTable:
         self._low, self._high = (wp.array(bound, dtype=float, device=device) for bound in (self.low, self.high))
         self.values = wp.zeros((world_count, column), dtype=float, device=device)
         self.finite = wp.zeros(world_count, dtype=wp.bool, device=device)
-        self._columns = self.columns_in(kernels.Columns)
+        size = self.segments["arm"][1].size if "arm" in self.segments else 0
+        columns = {"arm": -1, "arm_size": size, **{name: self.column(name) for name in self.segments}}
+        self._columns = filled(kernels.Columns, **columns)
 
     def column(self, segment: str) -> int:
         """Return the first column of a segment."""

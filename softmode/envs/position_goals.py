@@ -4,21 +4,18 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
-import numpy as np
 import warp as wp
 
 from softmode.deformables.model.structs import filled
 from softmode.envs import goal_kernels as kernels
 from softmode.envs.goals import GoalMethods
-from softmode.envs.observation import PROPRIOCEPTION, Segment
+from softmode.envs.observation import Segment, goal_part
 from softmode.envs.task import Task
 
 
 def goal_rules(config: Any, goal_size: int) -> Any:
     """Return what the reward depends on beside the goals, of a configuration with the fields of `PositionGoals`."""
-    sparse = int(config.reward_mode == "sparse")
-    arm_size = sum(segment.size for segment in PROPRIOCEPTION)
-    return filled(kernels.GoalRules, config, goal_size=goal_size, sparse=sparse, arm_size=arm_size)
+    return filled(kernels.GoalRules, config, goal_size=goal_size, sparse=int(config.reward_mode == "sparse"))
 
 
 class PositionGoals(Task):
@@ -37,14 +34,9 @@ class PositionGoals(Task):
     term_names = ("goal",)
 
     def object_segments(self) -> tuple[Segment, ...]:
-        """Proprioception again, so that what does not depend on the goal is one range, both goals, and the task's."""
-        low, high = (np.concatenate(part) for part in zip(*(s.bounds() for s in PROPRIOCEPTION), strict=True))
-        return (
-            Segment("arm", len(low), tuple(low.tolist()), tuple(high.tolist())),
-            Segment("achieved_goal", self.goal_size, -2.0, 2.0),
-            Segment("desired_goal", self.goal_size, -2.0, 2.0),
-            *super().object_segments(),
-        )
+        """Both goals, and what the task adds."""
+        reached = goal_part(self.scene.controller.joint_count, self.goal_size)
+        return (*reached, Segment("desired_goal", self.goal_size, -2.0, 2.0), *super().object_segments())
 
     def build(self) -> None:
         """Find the columns."""
@@ -69,5 +61,5 @@ class PositionGoalMethods(GoalMethods):
 
     def launch_reward(self, achieved: wp.array, desired: wp.array, reward: wp.array) -> None:
         """Compute the rewards of pairs of places."""
-        inputs = [achieved, desired, goal_rules(self.config, self.goal_size)]
+        inputs = [achieved, desired, goal_rules(self.config, self.task_class.goal_size)]
         wp.launch(kernels.compute_goal_reward, reward.shape[0], inputs=inputs, outputs=[reward], device=reward.device)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 import gymnasium as gym
 import numpy as np
@@ -15,8 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 from softmode.deformables.model.status import status_reasons
 from softmode.deformables.reduction.build_body import Progress
 from softmode.envs.arguments import (
-    RENDER_MODES,
     Shortcuts,
+    TaskEnv,
+    TaskT,
     checked_actions,
     checked_config,
     checked_device,
@@ -44,14 +45,13 @@ from softmode.envs.results import (
     write,
 )
 from softmode.envs.robots import Robot
-from softmode.envs.task import Task
 from softmode.envs.task_config import ObservationType, TaskConfig
 from softmode.errors import ConfigError
 from softmode.pause import collector_paused
 from softmode.vector_check.tensors import map_tree
 
 
-class SoftEnv(gym.Env, gym.utils.EzPickle):
+class SoftEnv(TaskEnv[TaskT], gym.Env, gym.utils.EzPickle):
     """One arm at a table with soft objects; subclasses name the task.
 
     Actions, float32 in [-1, 1], larger ones are clamped: with ``control_mode="pose_delta"`` (x, y, z, yaw, gripper)
@@ -102,9 +102,8 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
         AssetError: If the splat file cannot be used.
     """
 
-    metadata = {"render_modes": list(RENDER_MODES), "render_fps": 30}  # noqa: RUF012  (gymnasium's own convention)
-    task_class: ClassVar[type[Task]] = Task
-    """The task."""
+    task: TaskT
+    """The task in one world."""
 
     def __init__(
         self,
@@ -138,7 +137,7 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
         self.obs_type, self.render_mode = obs_type, render_mode
         self.metadata = {**self.metadata, "render_fps": round(self.config.scene.control_hz)}
         with collector_paused():
-            self.task = self.task_class(
+            self.task = self.task_class(  # type: ignore[assignment]  # the one in the brackets
                 self.config,
                 obs_type=obs_type,
                 render=render_mode is not None,

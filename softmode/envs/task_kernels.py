@@ -39,6 +39,8 @@ class Columns:
     object_velocity: int
     object_offset: int
     object_points: int
+    arm: int  # where proprioception stands again, -1 for nowhere
+    arm_size: int
 
 
 @wp.struct
@@ -191,7 +193,8 @@ def observe(
     """Write what every observation has.
 
     Proprioception: tool, heading, opening, finger forces, joints, and how far the command leads. Object 0: centre,
-    velocity, centre relative to the tool, and surface points relative to the centre.
+    velocity, centre relative to the tool, and surface points relative to the centre. Of tasks with goals proprioception
+    stands behind that again, so that what does not depend on the goal is one range.
     """
     w = wp.tid()
     p = tool_position(state, w)
@@ -218,6 +221,9 @@ def observe(
     write(observation, w, column.object_offset, x - p)
     for i in range(state.points.shape[1]):
         write(observation, w, column.object_points + 3 * i, surface_point(state, w, i) - x)
+    if column.arm >= 0:
+        for k in range(column.arm_size):
+            observation[w, column.arm + k] = observation[w, column.tool_position + k]
 
 
 @wp.kernel

@@ -66,7 +66,9 @@ def test_observation_says_where_to_go(push: PushSoftEnv) -> None:
     np.testing.assert_allclose(seen(push, observation, "push_offset"), behind - tool, atol=1e-6)
     assert info["goal_distance"] == pytest.approx(0.12, abs=1e-3) and info["yaw_error"] == pytest.approx(0.3, abs=1e-5)
     ahead = push.task.layout.agent_size
-    assert push.task.layout.column("object_position") == ahead and push.task.layout.column("goal") < ahead  # pixels see no object
+    assert (
+        push.task.layout.column("object_position") == ahead and push.task.layout.column("goal") < ahead
+    )  # pixels see no object
 
 
 def test_goals_stay_within_their_range(push: PushSoftEnv) -> None:

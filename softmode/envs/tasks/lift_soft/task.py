@@ -111,15 +111,9 @@ class LiftSoft(Task):
         return sphere_marker(0.4 * self.config.goal_tolerance)
 
 
-class LiftSoftEnv(SoftEnv):
+class LiftSoftEnv(SoftEnv[LiftSoft]):
     """One arm, one soft object, one goal; see :class:`LiftSoft` and :class:`SoftEnv`."""
 
-    config: LiftSoftConfig
-    task: LiftSoft
-    task_class = LiftSoft
 
-
-class LiftSoftVectorEnv(SoftVectorEnv):
+class LiftSoftVectorEnv(SoftVectorEnv[LiftSoft]):
     """Many worlds of it; see :class:`LiftSoft` and :class:`SoftVectorEnv`."""
-
-    task_class = LiftSoft

@@ -321,15 +321,9 @@ class PlaceInBin(Task):
         return square_camera(name, edge, (0.98, 0.02, 0.52), (0.42, 0.022, 0.04), 0.70)
 
 
-class PlaceInBinEnv(SoftEnv):
+class PlaceInBinEnv(SoftEnv[PlaceInBin]):
     """One arm, a toy, a bin with other soft objects; see :class:`PlaceInBin` and :class:`SoftEnv`."""
 
-    config: PlaceInBinConfig
-    task: PlaceInBin
-    task_class = PlaceInBin
 
-
-class PlaceInBinVectorEnv(SoftVectorEnv):
+class PlaceInBinVectorEnv(SoftVectorEnv[PlaceInBin]):
     """Many worlds of it; see :class:`PlaceInBin` and :class:`SoftVectorEnv`."""
-
-    task_class = PlaceInBin

@@ -196,15 +196,9 @@ class PressSoft(Task):
         return square_camera(name, edge, (0.80, -0.24, 0.21), (0.465, 0.015, 0.065), 0.42)
 
 
-class PressSoftEnv(SoftEnv):
+class PressSoftEnv(SoftEnv[PressSoft]):
     """One arm, one pad, one force; see :class:`PressSoft` and :class:`SoftEnv`."""
 
-    config: PressSoftConfig
-    task: PressSoft
-    task_class = PressSoft
 
-
-class PressSoftVectorEnv(SoftVectorEnv):
+class PressSoftVectorEnv(SoftVectorEnv[PressSoft]):
     """Many worlds of it; see :class:`PressSoft` and :class:`SoftVectorEnv`."""
-
-    task_class = PressSoft

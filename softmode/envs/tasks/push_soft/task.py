@@ -196,15 +196,9 @@ def _outline(thing: SoftObject) -> Splats:
     return dots(np.column_stack([outline, np.full(len(outline), 0.001)]), 0.0018, opacity=0.8)
 
 
-class PushSoftEnv(SoftEnv):
+class PushSoftEnv(SoftEnv[PushSoft]):
     """One arm, one soft object, one goal on the table; see :class:`PushSoft` and :class:`SoftEnv`."""
 
-    config: PushSoftConfig
-    task: PushSoft
-    task_class = PushSoft
 
-
-class PushSoftVectorEnv(SoftVectorEnv):
+class PushSoftVectorEnv(SoftVectorEnv[PushSoft]):
     """Many worlds of it; see :class:`PushSoft` and :class:`SoftVectorEnv`."""
-
-    task_class = PushSoft

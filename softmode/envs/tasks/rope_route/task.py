@@ -237,15 +237,9 @@ class RopeRoute(Task):
         return square_camera(name, edge, (0.95, -0.50, 0.62), (0.44, -0.10, 0.02), 0.68)
 
 
-class RopeRouteEnv(SoftEnv):
+class RopeRouteEnv(SoftEnv[RopeRoute]):
     """One arm, one rope, some pegs; see :class:`RopeRoute` and :class:`SoftEnv`."""
 
-    config: RopeRouteConfig
-    task: RopeRoute
-    task_class = RopeRoute
 
-
-class RopeRouteVectorEnv(SoftVectorEnv):
+class RopeRouteVectorEnv(SoftVectorEnv[RopeRoute]):
     """Many worlds of it; see :class:`RopeRoute` and :class:`SoftVectorEnv`."""
-
-    task_class = RopeRoute

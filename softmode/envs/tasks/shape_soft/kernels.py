@@ -44,13 +44,10 @@ class Plan:
     drawn_position: int
     drawn_yaw: int
     drawn_goal: int  # displacement [m] and direction [rad]
-    column_tool_position: int  # the first one of proprioception
     column_desired_goal: int
     column_achieved_goal: int
-    column_arm: int
     target: Target
     rules: Rules
-    arm_size: int  # how much proprioception is
 
 
 @wp.func
@@ -189,10 +186,8 @@ def observe_points(state: WorldState, plan: Plan, result: StepResult):
 
 @wp.kernel
 def observe(state: WorldState, plan: Plan, result: StepResult):
-    """Write the error, and proprioception once more."""
+    """Write the error."""
     w = wp.tid()
-    for k in range(plan.arm_size):
-        result.observation[w, plan.column_arm + k] = result.observation[w, plan.column_tool_position + k]
     seen = result.observation
     error = goal_error(seen, plan.column_achieved_goal, seen, plan.column_desired_goal, plan.rules, w)
     result.metrics[w, Metric.shape_error] = error

@@ -13,7 +13,7 @@ from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.body.rkpm import sample_farthest
 from softmode.deformables.model.structs import filled
 from softmode.envs.markers import dots, marker_per_object
-from softmode.envs.observation import PROPRIOCEPTION, Segment
+from softmode.envs.observation import Segment, goal_part
 from softmode.envs.parameters import Parameter
 from softmode.envs.soft_env import SoftEnv
 from softmode.envs.soft_vector_env import SoftVectorEnv
@@ -49,6 +49,7 @@ class ShapeSoft(Task):
     term_names = tuple(kernels.Term.__members__)
     metric_names = tuple(kernels.Metric.__members__)
     point_count = POINTS
+    goal_size = 3 * POINTS
 
     def build(self) -> None:
         """Record the targets."""
@@ -68,7 +69,6 @@ class ShapeSoft(Task):
         self.targets = ShapeTargets.from_presses(pressed, self.device)
         self.target = filled(kernels.Target, self.targets, choice=scene.occupancy.follow(choices, int))
         self.rules = reward_rules(self.config)
-        self.arm_size = self.segments["arm"][1].size
 
     def _record(self, choice: int) -> tuple[ReducedBody, Press, NDArray[np.intp]]:
         """Press what makes the targets of a choice of the scene; return its body, the press and the points chosen.
@@ -103,15 +103,11 @@ class ShapeSoft(Task):
 
     def goal_segments(self) -> tuple[Segment, ...]:
         """The points of the target shape [m]."""
-        return (Segment("desired_goal", 3 * self.point_count, -2.0, 2.0),)
+        return (Segment("desired_goal", self.goal_size, -2.0, 2.0),)
 
     def object_segments(self) -> tuple[Segment, ...]:
-        """Proprioception again, so that what does not depend on the goal is one range, and the points now [m]."""
-        low, high = (np.concatenate(part) for part in zip(*(s.bounds() for s in PROPRIOCEPTION), strict=True))
-        return (
-            Segment("arm", len(low), tuple(low.tolist()), tuple(high.tolist())),
-            Segment("achieved_goal", 3 * self.point_count, -2.0, 2.0),
-        )
+        """The points now [m]."""
+        return goal_part(self.scene.controller.joint_count, self.goal_size)
 
     def observe(self) -> None:
         """Write both goals and the error."""
@@ -135,16 +131,9 @@ def _surface(thing: SoftObject) -> Splats:
     return dots(thing.body.surface_points, 0.004, opacity=0.35)
 
 
-class ShapeSoftEnv(ShapeGoals, SoftEnv):
+class ShapeSoftEnv(ShapeGoals, SoftEnv[ShapeSoft]):
     """One arm, one soft post, one target shape; see :class:`ShapeSoft` and :class:`SoftEnv`."""
 
-    config: ShapeSoftConfig
-    task: ShapeSoft
-    task_class = ShapeSoft
 
-
-class ShapeSoftVectorEnv(ShapeGoals, SoftVectorEnv):
+class ShapeSoftVectorEnv(ShapeGoals, SoftVectorEnv[ShapeSoft]):
     """Many worlds of it; see :class:`ShapeSoft` and :class:`SoftVectorEnv`."""
-
-    config: ShapeSoftConfig
-    task_class = ShapeSoft
