@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
-from softmode.objects.loader import load
-from softmode.objects.soft_object import SoftObject
-from softmode.scenes.table_scene import TableSceneConfig
 from softmode.splats.splats import Splats
 
 GREEN = (0.20, 0.80, 0.35)
@@ -49,23 +44,3 @@ def dots(means: np.ndarray, size: float, *, color: tuple[float, float, float] = 
         sh=np.tile(((np.array(color) - 0.5) / harmonic).astype(np.float32), (count, 1, 1)),
         name="marker",
     )
-
-
-def marker_per_object(
-    scene: TableSceneConfig, world_count: int, draw: Callable[[SoftObject], Splats]
-) -> Splats | list[Splats]:
-    """Return a marker that depends on object 0; a list where the worlds differ, see `TableScene`.
-
-    Args:
-        scene: What the scene is built from.
-        world_count: Number of worlds.
-        draw: Makes the splats of an object.
-    """
-    given = scene.objects
-    if given is None:
-        return draw(load(scene.object, material=scene.material))
-    chosen = np.arange(given.count) if given.resample else given.chosen(world_count)
-    drawn = {
-        k: draw(load(given.config(k), material=given.material(k, scene.material))) for k in np.unique(chosen).tolist()
-    }
-    return drawn[chosen[0]] if len(drawn) == 1 and not given.resample else [drawn[k] for k in chosen.tolist()]

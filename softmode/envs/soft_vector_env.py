@@ -98,24 +98,6 @@ class SoftVectorEnv(TaskEnv[TaskT], gym.vector.VectorEnv):
         **fields: Any,
     ) -> None:
         """Build the scene, capture the step and make the spaces."""
-        self._arguments = {
-            "num_envs": num_envs,
-            "obs_type": obs_type,
-            "render_mode": render_mode,
-            "control_mode": control_mode,
-            "splat": splat,
-            "size": size,
-            "preset": preset,
-            "robot": robot,
-            "config": config,
-            "max_episode_steps": max_episode_steps,
-            "autoreset_mode": autoreset_mode,
-            "output": output,
-            "processes": processes,
-            "device": device,
-            **fields,
-        }
-        """What a copy is made from; a callback is not."""
         self.num_envs = checked_count("num_envs", num_envs)
         if max_episode_steps is not None:
             max_episode_steps = checked_count("max_episode_steps", max_episode_steps)
@@ -134,6 +116,18 @@ class SoftVectorEnv(TaskEnv[TaskT], gym.vector.VectorEnv):
             preset=preset,
             robot=robot,
         )
+        self._arguments = {
+            **vars(given),
+            "num_envs": num_envs,
+            "config": config,
+            "max_episode_steps": max_episode_steps,
+            "autoreset_mode": autoreset_mode,
+            "output": output,
+            "processes": processes,
+            "device": device,
+            **fields,
+        }
+        """What a copy is made from; a callback is not."""
         config = checked_config(self.task_class.config_class, config, given, self.task_class.any_robot, fields)
         if output == "torch":
             try:

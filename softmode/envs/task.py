@@ -40,10 +40,9 @@ from softmode.objects.rest_grasps import rest_grasps
 from softmode.robots.jaws import ParallelJaw
 from softmode.scenes.capture import capture_graph
 from softmode.scenes.occupancy import Occupancy
-from softmode.scenes.table_scene import TableScene, TableSceneConfig
+from softmode.scenes.table_scene import Marker, TableScene, TableSceneConfig
 from softmode.splats.cameras.camera import CameraOptions
 from softmode.splats.raster.pinhole import PinholeCamera
-from softmode.splats.splats import Splats
 
 
 class Task:
@@ -303,10 +302,10 @@ class Task:
         judged = {name: getattr(self.episodes, name) for name in (*names, "reward", "terms", "metrics")}
         return {**drawn, **judged, "finite": layout.finite, "observation": layout.values}
 
-    def marker(self) -> Splats | Sequence[Splats] | None:
-        """Return the splats that mark the goal in pictures, a list for worlds that differ.
+    def marker(self) -> Marker | None:
+        """Return the splats that mark the goal in pictures, or what draws them for an object.
 
-        `observe` writes `scene.marker_place`. For one that depends on object 0 see `markers.marker_per_object`.
+        `observe` writes `scene.marker_place`.
         """
         return None
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from softmode.objects.loader import Progress, load
 from softmode.objects.object_set import ObjectSet
 from softmode.objects.soft_object import SoftObject
 from softmode.scenes import occupancy_kernels as kernels
+from softmode.splats.splats import Splats
 
 
 class Occupancy:
@@ -131,6 +132,17 @@ class Occupancy:
         count = self.slots + len(self.others)
         there = range(count) if self.slots == 1 else np.flatnonzero(self.chosen[world] >= 0).tolist()
         return tuple(world * count + k for k in there)
+
+    def drawn(self, draw: Callable[[SoftObject], Splats]) -> Splats | list[Splats]:
+        """Return what is drawn for the first object: one for all, or one per world, or per choice where resets choose.
+
+        Args:
+            draw: Makes the splats of an object.
+        """
+        made = [draw(thing) for thing in self.choices]
+        if self.resampled:
+            return made
+        return made[0] if len(made) == 1 else [made[row] for row in self.rows]
 
     @property
     def heights(self) -> NDArray[np.float64]:

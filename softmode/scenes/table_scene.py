@@ -1,6 +1,6 @@
 """A robot arm at a table with soft objects, in any number of worlds: model, solver, controller, cameras, graphs."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -46,6 +46,8 @@ from softmode.splats.cameras.camera_randomization import CameraRandomization
 from softmode.splats.raster.pinhole import PinholeCamera
 from softmode.splats.splats import Splats
 
+Marker = Splats | Callable[[SoftObject], Splats]
+"""What marks a place in pictures: splats around the origin, or what draws them for the first object of a world."""
 GAP = 2.0e-4
 """Height over the table at which objects are put down [m]."""
 TABLE_PLACE = (0.35, 0.0, -0.03)
@@ -113,8 +115,8 @@ class TableScene:
         film: Cameras of one image size whose pictures people look at; see :meth:`draw_film`.
         camera_options: Light and background.
         camera_randomization: What `randomize` of the cameras draws.
-        marker: Splats around the origin that mark a place, such as a goal, in pictures; they touch nothing. A list of
-            them has those of each world, or of each object of the set where a reset may change the object.
+        marker: Splats around the origin that mark a place, such as a goal, in pictures, or what draws them for the
+            first object of a world; they touch nothing.
         device: Warp device; the default one if None.
         progress: Reports the build of the object, see :func:`softmode.deformables.reduction.build_body.build_body`.
     """
@@ -128,7 +130,7 @@ class TableScene:
         film: Sequence[PinholeCamera] = (),
         camera_options: CameraOptions | None = None,
         camera_randomization: CameraRandomization | None = None,
-        marker: Splats | Sequence[Splats] | None = None,
+        marker: Marker | None = None,
         device: wp.DeviceLike = None,
         progress: Progress = None,
     ) -> None:
@@ -163,8 +165,9 @@ class TableScene:
         self.marker_place = wp.zeros(world_count, dtype=wp.transform, device=self.device)
         """Where the marker is drawn, transform, shape (world_count,)."""
         self.marker_place.fill_(wp.transform_identity())
-        self.marker = marker
-        """Splats that mark a place in pictures, as they were given; the last ones of `splats`."""
+        self.marker = self.occupancy.drawn(marker) if callable(marker) else marker
+        """Splats that mark a place in pictures, the last ones of `splats`: one for all, or one per world, or per choice
+        of `occupancy` where a reset may change the object."""
         self.splats: BoundSplats | None = None
         """The splats of the objects, then those of the marker, as cameras see them; None without cameras."""
         self.cameras: dict[tuple[int, int], SplatCamera] = {}
@@ -174,9 +177,10 @@ class TableScene:
         if cameras or film:
             held = self.occupancy
             choices = {"choices": held.choices, "choice": held.choice} if held.resampled else {}
-            self.splats = BoundSplats(self.model, held.shown, others=() if marker is None else (marker,), **choices)
-            if marker is not None:
-                rest, one = self.splats.table.means.numpy()[:, self.splats.columns[-1]], isinstance(marker, Splats)
+            marked = () if self.marker is None else (self.marker,)
+            self.splats = BoundSplats(self.model, held.shown, others=marked, **choices)
+            if self.marker is not None:
+                rest, one = self.splats.table.means.numpy()[:, self.splats.columns[-1]], isinstance(self.marker, Splats)
                 if held.resampled and not one:
                     self.marker_points = held.follow(rest, wp.vec3)
                 else:
@@ -190,7 +194,7 @@ class TableScene:
         if film and self.splats is not None:
             seen, columns = self.splats.arrays, self.splats.columns
             things = slice(0, columns[len(self.splats.indices) - 1].stop)
-            goal = None if marker is None else columns_of(seen, columns[-1])
+            goal = None if self.marker is None else columns_of(seen, columns[-1])
             self.film = FilmCamera(self.model, self.state, columns_of(seen, things), goal, film)
         self._graph: Recording | None = None
         self._camera_graphs: dict[tuple[int, int], Recording] = {}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,7 +12,7 @@ from scipy.spatial import ConvexHull
 from softmode.checks import require_fields, require_number, require_range
 from softmode.deformables.materials.material import Material
 from softmode.deformables.reduction.options import BuildOptions
-from softmode.envs.markers import dots, marker_per_object
+from softmode.envs.markers import dots
 from softmode.envs.observation import Segment
 from softmode.envs.parameters import Parameter
 from softmode.envs.placement import Arcs
@@ -29,7 +28,7 @@ from softmode.objects.soft_object import SoftObject
 from softmode.robots.arm import ArmDescription
 from softmode.robots.control import ArmControlOptions
 from softmode.robots.table_robot import TableRobot
-from softmode.scenes.table_scene import TableSceneConfig
+from softmode.scenes.table_scene import Marker, TableSceneConfig
 from softmode.splats.splats import Splats
 
 PUCK = ObjectConfig(
@@ -178,9 +177,9 @@ class PushSoft(Task):
         """Add how far the object was from its goal a step ago."""
         return {**super().state_arrays(), "before": self.before}
 
-    def marker(self) -> Splats | Sequence[Splats]:
-        """Return the outline of the object, to be drawn on the table; a list where the worlds differ."""
-        return marker_per_object(self.scene_config(), self.world_count, _outline)
+    def marker(self) -> Marker:
+        """Return what draws the outline of an object, to lie on the table."""
+        return _outline
 
 
 def _outline(thing: SoftObject) -> Splats:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.body.rkpm import sample_farthest
 from softmode.deformables.model.structs import filled
-from softmode.envs.markers import dots, marker_per_object
+from softmode.envs.markers import dots
 from softmode.envs.observation import Segment, goal_part
 from softmode.envs.parameters import Parameter
 from softmode.envs.soft_env import SoftEnv
@@ -25,7 +24,7 @@ from softmode.envs.tasks.shape_soft.targets import Press, ShapeTargets, record_p
 from softmode.errors import ConfigError
 from softmode.objects.loader import load
 from softmode.objects.soft_object import SoftObject
-from softmode.scenes.table_scene import TableScene
+from softmode.scenes.table_scene import Marker, TableScene
 from softmode.splats.splats import Splats
 
 
@@ -118,12 +117,12 @@ class ShapeSoft(Task):
             points, inputs = self.scene.marker_points, [self.state, self.plan, self.point_count]
             self.launch(kernels.shape_marker, inputs, [points, self.result], points.shape)
 
-    def marker(self) -> Splats | Sequence[Splats]:
-        """Return the surface of the body that makes the targets; `observe` bends it. A list where the worlds differ."""
+    def marker(self) -> Marker:
+        """Return the surface of what makes the targets, or what draws that of an object; `observe` bends it."""
         goal = self.config.goal_object
         if goal is not None:
             return _surface(load(goal, material=self.config.scene.material))
-        return marker_per_object(self.scene_config(), self.world_count, _surface)
+        return _surface
 
 
 def _surface(thing: SoftObject) -> Splats:
