@@ -30,6 +30,9 @@ from softmode.objects import ObjectConfig
 from softmode.scenes import TableSceneConfig
 from softmode.viz import Film
 
+# Warp's structs are no classes to a type checker.
+# pyright: reportGeneralTypeIssues=false
+
 # ----------------------------------------------------------------------------------------------------------------------
 RADIUS, HEIGHT = 0.02, 0.12  # of the post [m]
 POST = TableSceneConfig(object=ObjectConfig(shape="cylinder", extents=(2 * RADIUS, 2 * RADIUS, HEIGHT)))

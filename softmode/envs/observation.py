@@ -129,7 +129,7 @@ class ObservationTable:
         self, agent: Iterable[Segment], rest: Iterable[Segment], world_count: int, device: wp.DeviceLike = None
     ) -> None:
         """Give every segment its columns."""
-        agent = tuple(agent)
+        agent, self._device = tuple(agent), wp.get_device(device)
         self.segments: dict[str, tuple[slice, Segment]] = {}
         column = 0
         for segment in (*agent, *rest):
@@ -172,7 +172,7 @@ class ObservationTable:
             state: A `WorldState`.
             arm: An `ArmState`.
         """
-        device, (worlds, _) = self.values.device, self.values.shape
+        device, worlds = self._device, self.values.shape[0]
         launch(device, kernels.observe, worlds, state, arm, self._columns, self.values)
         if "object_one_hot" in self.segments:
             columns, segment = self.segments["object_one_hot"]
@@ -186,4 +186,4 @@ class ObservationTable:
     def bound(self) -> None:
         """Clip the vectors to their bounds, and flag what is not finite; capturable."""
         bounds = (self._low, self._high)
-        launch(self.values.device, kernels.bound_observation, self.values.shape[0], *bounds, self.values, self.finite)
+        launch(self._device, kernels.bound_observation, self.values.shape[0], *bounds, self.values, self.finite)

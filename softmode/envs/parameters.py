@@ -104,7 +104,8 @@ class ParameterTable:
 
     def use_seeds(self, seeds: ArrayLike, mask: NDArray[np.bool_]) -> NDArray[np.int64]:
         """Give the masked worlds seeds, whose episodes count from zero; return the seeds of all."""
-        chosen, count = self.seed.numpy().copy(), self.episode.numpy().copy()
+        chosen: NDArray[Any] = self.seed.numpy().copy()
+        count: NDArray[Any] = self.episode.numpy().copy()
         chosen[mask] = np.asarray(seeds, np.int64)[mask] & 0x7FFFFFFF
         count[mask] = -1
         self.seed.assign(chosen)
@@ -115,7 +116,7 @@ class ParameterTable:
         """Draw objects and parameters of the masked worlds; capturable."""
         self.occupancy.draw(world_mask, self.seed, self.episode)
         inputs = (world_mask, self.seed, self.occupancy.row, self.low, self.high, self._log)
-        launch(self.values.device, kernels.draw_parameters, self.world_count, *inputs, self.episode, self.values)
+        launch(self.occupancy.device, kernels.draw_parameters, self.world_count, *inputs, self.episode, self.values)
 
     def draw_with(self, world_mask: wp.array, options: Mapping[str, NDArray[np.float32]]) -> None:
         """Draw what options do not give.
@@ -124,13 +125,14 @@ class ParameterTable:
             world_mask: Which worlds.
             options: Checked values, see `check_options`.
         """
-        mask, given = world_mask.numpy(), dict(options)
+        mask: NDArray[Any] = world_mask.numpy()
+        given = dict(options)
         if "object" in given:
             self.occupancy.ask(given.pop("object"), mask)
         self.draw(world_mask)
         self.occupancy.ask_nothing()
         if given:
-            values = self.values.numpy().copy()
+            values: NDArray[Any] = self.values.numpy().copy()
             for name, numbers in given.items():
                 values[mask, self.columns(name)] = numbers[mask]
             self.values.assign(values)
@@ -168,7 +170,7 @@ class Materials:
         """Give the bodies of the masked worlds the materials and sizes of their parameters; capturable."""
         held, values = self._table.occupancy, self._all
         inputs = (self._table.values, self._stride, self._columns, self._own, held.choice, held.slots)
-        launch(values.device, kernels.spread_materials, values.shape[1], *inputs, values)
+        launch(held.device, kernels.spread_materials, values.shape[1], *inputs, values)
         wp.copy(self._mask, world_mask, count=world_mask.shape[0])
         set_parameters(self._solver, self._mask, **self.values)
 

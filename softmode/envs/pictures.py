@@ -11,6 +11,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from softmode.envs.cameras import FollowCamera
+from softmode.envs.task_config import ImageOutput
 from softmode.scenes.table_scene import TableScene
 from softmode.splats.raster.pinhole import PinholeCamera
 
@@ -39,7 +40,7 @@ class Pictures:
         self,
         scene: TableScene,
         edge: int | None,
-        outputs: Sequence[str],
+        outputs: Sequence[ImageOutput],
         follow: PinholeCamera,
         *,
         keep_last: bool = False,
@@ -81,7 +82,7 @@ class Pictures:
                 spaces[name] = gym.spaces.Box(-1, count, (edge, edge), np.int32)
         return spaces
 
-    def draw_film(self, scale: NDArray[np.floating], time: NDArray[np.floating]) -> NDArray[np.uint8]:
+    def draw_film(self, scale: NDArray[Any], time: NDArray[Any]) -> NDArray[np.uint8]:
         """Return the pictures of the film cameras side by side, uint8 (world_count, edge, cameras * edge, 3).
 
         Args:
@@ -99,7 +100,7 @@ class Pictures:
         """Let the following camera jump to its place in the masked worlds, shape (world_count,)."""
         self._follow.forget(mask)
 
-    def _in_focus(self, scale: NDArray[np.floating]) -> NDArray[np.float64]:
+    def _in_focus(self, scale: NDArray[Any]) -> NDArray[np.float64]:
         """Return balls (x, y, z, radius) [m] about object 0, the hand and the marker, shape (world_count, K, 4)."""
         scene = self._scene
         radius: Any = np.array([thing.radius for thing in scene.occupancy.choices])[scene.occupancy.rows] * scale

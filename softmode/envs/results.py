@@ -35,7 +35,7 @@ def spaces_of(task: Task) -> tuple[gym.spaces.Box, gym.Space]:
     actions = gym.spaces.Box(-1.0, 1.0, (task.scene.controller.action_size,), np.float32)
     layout = task.layout
     if task.obs_type == "state":
-        keys = {name: layout.space(columns) for name, columns in layout.keys.items()}
+        keys: dict[str, gym.Space] = {name: layout.space(columns) for name, columns in layout.keys.items()}
         return actions, gym.spaces.Dict(keys) if keys else layout.space(slice(0, len(layout.low)))
     spaces = task.pictures.spaces()
     if task.obs_type == "pixels_agent_pos":
@@ -45,7 +45,7 @@ def spaces_of(task: Task) -> tuple[gym.spaces.Box, gym.Space]:
 
 def film_of(task: Task) -> NDArray[np.uint8]:
     """Return a frame per world: the pictures of the film cameras side by side."""
-    scale = task.table.values.numpy()[:, task.table.column("scale")]
+    scale: NDArray[Any] = task.table.values.numpy()[:, task.table.column("scale")]
     return task.pictures.draw_film(scale, task.episodes.elapsed.numpy() / task.config.scene.control_hz)
 
 

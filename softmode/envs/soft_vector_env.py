@@ -6,7 +6,7 @@ import copy
 import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, Self, get_args
+from typing import Any, Literal, Self, cast, get_args
 
 import gymnasium as gym
 import numpy as np
@@ -314,7 +314,7 @@ class SoftVectorEnv(TaskEnv[TaskT], gym.vector.VectorEnv):
         """
         if not isinstance(self._worlds[0], LocalWorlds):
             raise ConfigError("the worlds live in other processes", hint="make the environment with processes=1")
-        return self._worlds[0].task
+        return cast(Any, self._worlds[0].task)  # the one in the brackets
 
     @property
     def state_observation(self) -> Any:

@@ -208,7 +208,8 @@ class Task:
             self.pictures = Pictures(scene, edge, config.image_outputs, follow, keep_last=keep_last)
             self.build()
             self.plan = None if self.step_kernels is None else _plan(self, self.step_kernels[0])
-            compile_launches(lambda: (self.before_step(), self.judge(self.episodes.never), self.clear()), self.device)
+            for launches in (self.before_step, partial(self.judge, self.episodes.never), self.clear):
+                compile_launches(launches, self.device)
         self.reset()
         self.graph = capture_graph(self._step, self.device)
 

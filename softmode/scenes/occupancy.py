@@ -81,7 +81,7 @@ class Occupancy:
                 loaded[kind, own] = load(kind, material=own, progress=progress)
             return loaded[kind, own]
 
-        self.choices = tuple(loaded_once(kind, own) for kind, own in kinds)
+        self.choices: tuple[SoftObject, ...] = tuple(loaded_once(kind, own) for kind, own in kinds)
         self.materials = tuple(
             own or made.material or material for made, (_, own) in zip(self.choices, kinds, strict=True)
         )
@@ -118,7 +118,7 @@ class Occupancy:
     def shown(self) -> tuple[SoftObject | list[SoftObject], ...]:
         """The soft bodies of a world, a list with one per world where the first differs."""
         differs = len(self.choices) > 1 or self.resampled
-        first = [self.choices[row] for row in self.rows] if differs else self.choices[0]
+        first: Any = [self.choices[row] for row in self.rows] if differs else next(iter(self.choices))
         return (*[first] * self.slots, *self.others)
 
     def objects_of(self, world: int) -> tuple[SoftObject, ...]:
