@@ -56,6 +56,17 @@ class ParameterColumns(Protocol):
         ...
 
 
+class RecordedEpisodes(Protocol):
+    """How the episodes of all worlds go on, as :class:`softmode.envs.episodes.Episodes` tells; each (world_count,)."""
+
+    elapsed: wp.array
+    """Steps of the episode."""
+    reward: wp.array
+    """Reward of the step."""
+    end: wp.array
+    """Why the episode ended, one of `RecordedTask.end_reasons`."""
+
+
 @runtime_checkable
 class RecordedTask(Protocol):
     """A task that runs in worlds of this process, as :class:`softmode.envs.task.Task` does."""
@@ -64,14 +75,10 @@ class RecordedTask(Protocol):
     """Where it happens."""
     table: ParameterColumns
     """What was drawn for each episode."""
-    elapsed: wp.array
-    """Steps of the episode, shape (world_count,)."""
-    reward: wp.array
-    """Reward of the step."""
+    episodes: RecordedEpisodes
+    """How far each episode is, and how it ends."""
     success: wp.array
-    """Whether the task counts as solved."""
-    end: wp.array
-    """Why the episode ended, one of `end_reasons`."""
+    """Whether the task counts as solved, shape (world_count,)."""
     end_reasons: type[IntEnum]
     """RUNNING, TIME_LIMIT, and failures."""
     observation: wp.array
