@@ -207,7 +207,7 @@ class Task:
             follow = self.render_cameras()[0]
             self.pictures = Pictures(scene, edge, config.image_outputs, follow, keep_last=keep_last)
             self.build()
-            self.plan = None if self.step_kernels is None else _plan(self, self.step_kernels[0])
+            self.plan = None if self.step_kernels is None else plan_of(self, self.step_kernels[0])
             for launches in (self.before_step, partial(self.judge, self.episodes.never), self.clear):
                 compile_launches(launches, self.device)
         self.reset()
@@ -440,7 +440,7 @@ def _layout(task: Task) -> ObservationTable:
     return ObservationTable(agent, seen, task.world_count, task.device)
 
 
-def _plan(task: Task, kernel: Any) -> Any:
+def plan_of(task: Task, kernel: Any) -> Any:
     """Return the second argument of a task's kernel, its fields found by their names.
 
     Raises:

@@ -15,8 +15,10 @@ from gymnasium.utils.env_checker import data_equivalence
 
 import softmode
 from softmode.deformables.model.status import status_reasons
+from softmode.envs.task import plan_of
 from softmode.envs.task_kernels import bound_observation
 from softmode.envs.tasks.lift_soft.task import LiftSoftConfig, LiftSoftEnv
+from softmode.envs.tasks.press_soft import kernels as press_kernels
 from softmode.errors import ConfigError, MaterialError
 from softmode.pause import collector_paused
 from tests.envs.conftest import MakeEnv
@@ -331,6 +333,12 @@ def test_an_object_off_the_table_ends_the_episode(lift: LiftSoftEnv) -> None:
     assert terminated and not truncated and info["failure"] == "dropped" and not info["is_success"]
     assert fall - 1 <= steps <= fall + 2
     assert lift.observation_space.contains(observation)
+
+
+def test_kernels_ask_for_what_a_task_has(lift: LiftSoftEnv) -> None:
+    """A field of a plan that is no parameter, segment or attribute is named."""
+    with pytest.raises(ConfigError, match="'drawn_goal_force', which nothing has"):
+        plan_of(lift.task, press_kernels.observe)
 
 
 def test_numbers_beyond_the_bounds_are_clipped(lift: LiftSoftEnv) -> None:
