@@ -11,14 +11,20 @@ from softmode.lazy import lazy_names
 
 if TYPE_CHECKING:
     from softmode.envs.adapters import RslRlVecEnv, SkrlWrapper, StableBaselinesVecEnv
-    from softmode.envs.end_reason import EndReason
     from softmode.envs.env_state import EnvState
     from softmode.envs.observation import Segment
     from softmode.envs.parameters import Parameter
     from softmode.envs.presets import rl_scene
-    from softmode.envs.reward_kernels import StepResult, WorldState, count_held, surface_point, tool_position, write
-    from softmode.envs.scripted import scripted_policy, scripted_worlds
-    from softmode.envs.scripted_base import ScriptedPolicy
+    from softmode.envs.reward_kernels import (
+        EndReason,
+        StepResult,
+        WorldState,
+        count_held,
+        surface_point,
+        tool_position,
+        write,
+    )
+    from softmode.envs.scripted import ScriptedPolicy, scripted_policy, scripted_worlds
     from softmode.envs.soft_env import SoftEnv
     from softmode.envs.soft_vector_env import SoftVectorEnv
     from softmode.envs.task import Task

@@ -11,8 +11,8 @@ import warp as wp
 from numpy.typing import NDArray
 
 from softmode.envs.cameras import FollowCamera
-from softmode.envs.task_config import ImageOutput
 from softmode.scenes.table_scene import TableScene
+from softmode.splats.cameras.camera import Output
 from softmode.splats.raster.pinhole import PinholeCamera
 
 HAND = 0.07
@@ -40,7 +40,7 @@ class Pictures:
         self,
         scene: TableScene,
         edge: int | None,
-        outputs: Sequence[ImageOutput],
+        outputs: Sequence[Output],
         follow: PinholeCamera,
         *,
         keep_last: bool = False,

@@ -24,10 +24,10 @@ from softmode.envs.arguments import (
     checked_options,
     world_seed,
 )
-from softmode.envs.end_reason import EndReason
 from softmode.envs.env_state import EnvState, checked_state, generator_of, generator_state
 from softmode.envs.parameters import check_options
 from softmode.envs.results import name_of, take
+from softmode.envs.reward_kernels import EndReason
 from softmode.envs.robots import Robot
 from softmode.envs.task_config import ObservationType, TaskConfig
 from softmode.envs.worlds import LocalWorlds

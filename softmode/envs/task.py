@@ -20,7 +20,6 @@ from softmode.deformables.model.structs import filled
 from softmode.deformables.reduction.build_body import Progress
 from softmode.envs import task_kernels as kernels
 from softmode.envs.cameras import overview, square_camera, wrist_camera
-from softmode.envs.end_reason import EndReason
 from softmode.envs.episodes import FALL, Episodes
 from softmode.envs.observation import (
     ObservationTable,
@@ -33,7 +32,7 @@ from softmode.envs.observation import (
 from softmode.envs.parameters import Materials, Parameter, ParameterTable
 from softmode.envs.pictures import Pictures
 from softmode.envs.placement import Arcs, Placement, clutter_parameters
-from softmode.envs.reward_kernels import StepResult, WorldState
+from softmode.envs.reward_kernels import EndReason, StepResult, WorldState
 from softmode.envs.task_config import ObservationType, TaskConfig
 from softmode.errors import ConfigError, GraspError
 from softmode.objects.rest_grasps import rest_grasps

@@ -4,8 +4,15 @@ from typing import Any
 
 import warp as wp
 
-from softmode.envs.end_reason import EndReason
-from softmode.envs.reward_kernels import StepResult, WorldState, is_there, surface_point, tool_position, write
+from softmode.envs.reward_kernels import (
+    EndReason,
+    StepResult,
+    WorldState,
+    is_there,
+    surface_point,
+    tool_position,
+    write,
+)
 
 wp.set_module_options({"enable_backward": False})
 

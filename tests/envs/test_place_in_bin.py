@@ -12,7 +12,7 @@ import pytest
 import softmode  # noqa: F401  (registers the environments)
 from softmode.deformables.model.status import WORLD_COLLAPSED, WORLD_ITERATION_LIMIT, WORLD_PENETRATION
 from softmode.deformables.reduction.options import BuildOptions
-from softmode.envs.end_reason import EndReason
+from softmode.envs.reward_kernels import EndReason
 from softmode.envs.scripted import scripted_policy
 from softmode.envs.tasks.place_in_bin.scripted import ScriptedPlace
 from softmode.envs.tasks.place_in_bin.task import Bin, PlaceInBinConfig, PlaceInBinEnv, bin_scene

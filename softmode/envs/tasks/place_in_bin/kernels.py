@@ -4,9 +4,9 @@ from enum import IntEnum
 
 import warp as wp
 
-from softmode.envs.end_reason import EndReason
 from softmode.envs.reward_kernels import (
     NEAR,
+    EndReason,
     StepResult,
     WorldState,
     count_held,

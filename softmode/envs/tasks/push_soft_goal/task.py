@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from softmode.envs.position_goals import PositionGoalMethods, PositionGoals
+from softmode.envs.goals import PositionGoalMethods, PositionGoals
 from softmode.envs.soft_env import SoftEnv
 from softmode.envs.soft_vector_env import SoftVectorEnv
 from softmode.envs.tasks.push_soft.task import PushSoft, PushSoftConfig

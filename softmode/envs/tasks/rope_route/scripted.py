@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softmode.envs.reward_kernels import TOUCH_FORCE
-from softmode.envs.scripted_base import Environment, ScriptedPolicy, Vector, bounded
+from softmode.envs.scripted import Environment, ScriptedPolicy, Vector, bounded
 from softmode.envs.tasks.rope_route.task import RopeRoute
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.envs.scripted_base import Environment, ScriptedPolicy, bounded, half_turn
+from softmode.envs.scripted import Environment, ScriptedPolicy, bounded, half_turn
 from softmode.envs.tasks.shape_soft.task import ShapeSoft
 
 
