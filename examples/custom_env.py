@@ -14,23 +14,12 @@ import numpy as np
 import warp as wp
 from gymnasium.utils.env_checker import check_env
 
-from softmode.envs import (
-    Segment,
-    SoftEnv,
-    SoftVectorEnv,
-    StepResult,
-    Task,
-    TaskConfig,
-    WorldState,
-    check_vector_env,
-    rl_scene,
-    tool_position,
-)
+from softmode import envs
+from softmode.envs import Segment, SoftEnv, SoftVectorEnv, StepResult, Task, TaskConfig, WorldState, rl_scene
 from softmode.objects import ObjectConfig
 from softmode.scenes import TableSceneConfig
 from softmode.viz import Film
 
-# Warp's structs are no classes to a type checker.
 # pyright: reportGeneralTypeIssues=false
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -67,7 +56,7 @@ def observe(state: WorldState, plan: Plan, result: StepResult):
 def judge(state: WorldState, plan: Plan, result: StepResult):
     """Reward nearness and the fall; the task is solved while the post lies."""
     w = wp.tid()
-    gap = wp.length(state.object_position[w, 0] - tool_position(state, w))
+    gap = wp.length(state.object_position[w, 0] - wp.transform_get_translation(state.tool_pose[w]))
     result.terms[w, 0] = 1.0 - wp.tanh(5.0 * gap)
     result.terms[w, 1] = 3.0 * wp.clamp(1.0 - result.metrics[w, 0], 0.0, 1.0)
     result.success[w] = result.metrics[w, 0] < plan.fallen
@@ -84,14 +73,8 @@ class Topple(Task):
         return (Segment("upright", 1, -2.0, 3.0),)
 
 
-class ToppleEnv(SoftEnv[Topple]):
-    """One world."""
-
-
-class ToppleVectorEnv(SoftVectorEnv[Topple]):
-    """Many worlds."""
-
-
+ToppleEnv = type("ToppleEnv", (SoftEnv,), {"task_class": Topple})
+ToppleVectorEnv = type("ToppleVectorEnv", (SoftVectorEnv,), {"task_class": Topple})
 gym.register("Topple-v0", entry_point=ToppleEnv, vector_entry_point=ToppleVectorEnv, max_episode_steps=90)
 # ----------------------------------------------------------------------------------------------------------------------
 
@@ -120,7 +103,7 @@ def main(arguments: list[str] | None = None) -> None:
     wp.config.log_level = wp.LOG_WARNING
     env, ends = gym.make("Topple-v0", render_mode="rgb_array"), []
     check_env(env.unwrapped)
-    print(check_vector_env(lambda n: gym.make_vec("Topple-v0", n, max_episode_steps=8), num_envs=2, steps=20))
+    print(envs.check_vector_env(lambda n: gym.make_vec("Topple-v0", n, max_episode_steps=8), num_envs=2, steps=20))
     with Film(Path("out/custom_env.mp4")) as film:
         for seed in range(episodes):
             ended, _ = [False], env.reset(seed=seed)
