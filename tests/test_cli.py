@@ -158,8 +158,8 @@ def rest(env):
 class SlowLift(LiftSoft):
     scripted_policy = rest
 
-class SlowLiftEnv(SoftEnv):
-    task_class = SlowLift
+class SlowLiftEnv(SoftEnv[SlowLift]):
+    pass
 
 gym.register("SlowLift-v0", entry_point=SlowLiftEnv, max_episode_steps=3)
 """

@@ -13,15 +13,20 @@ if TYPE_CHECKING:
     from softmode.envs.adapters import RslRlVecEnv as RslRlVecEnv
     from softmode.envs.adapters import SkrlWrapper as SkrlWrapper
     from softmode.envs.adapters import StableBaselinesVecEnv as StableBaselinesVecEnv
-    from softmode.envs.end_reason import EndReason as EndReason
     from softmode.envs.env_state import EnvState as EnvState
     from softmode.envs.observation import Segment as Segment
     from softmode.envs.parameters import Parameter as Parameter
     from softmode.envs.presets import rl_scene as rl_scene
+    from softmode.envs.reward_kernels import EndReason as EndReason
+    from softmode.envs.reward_kernels import StepResult as StepResult
     from softmode.envs.reward_kernels import WorldState as WorldState
+    from softmode.envs.reward_kernels import count_held as count_held
+    from softmode.envs.reward_kernels import surface_point as surface_point
+    from softmode.envs.reward_kernels import tool_position as tool_position
+    from softmode.envs.reward_kernels import write as write
+    from softmode.envs.scripted import ScriptedPolicy as ScriptedPolicy
     from softmode.envs.scripted import scripted_policy as scripted_policy
     from softmode.envs.scripted import scripted_worlds as scripted_worlds
-    from softmode.envs.scripted_base import ScriptedPolicy as ScriptedPolicy
     from softmode.envs.soft_env import SoftEnv as SoftEnv
     from softmode.envs.soft_vector_env import SoftVectorEnv as SoftVectorEnv
     from softmode.envs.task import Task as Task
@@ -58,16 +63,6 @@ if TYPE_CHECKING:
     from softmode.envs.tasks.shape_soft.task import ShapeSoft as ShapeSoft
     from softmode.envs.tasks.shape_soft.task import ShapeSoftEnv as ShapeSoftEnv
     from softmode.envs.tasks.shape_soft.task import ShapeSoftVectorEnv as ShapeSoftVectorEnv
-    from softmode.envs.term_task import TermTask as TermTask
-    from softmode.envs.terms import CurriculumTerm as CurriculumTerm
-    from softmode.envs.terms import EventTerm as EventTerm
-    from softmode.envs.terms import MetricTerm as MetricTerm
-    from softmode.envs.terms import ObservationTerm as ObservationTerm
-    from softmode.envs.terms import RewardTerm as RewardTerm
-    from softmode.envs.terms import SuccessTerm as SuccessTerm
-    from softmode.envs.terms import TermConfig as TermConfig
-    from softmode.envs.terms import TerminationTerm as TerminationTerm
-    from softmode.envs.terms import Terms as Terms
     from softmode.envs.throughput import measure_throughput as measure_throughput
     from softmode.vector_check import VectorEnvReport as VectorEnvReport
     from softmode.vector_check import check_vector_env as check_vector_env

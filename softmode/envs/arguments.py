@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, ClassVar, Generic, TypeVar, get_args
 
 import gymnasium as gym
 import numpy as np
@@ -16,12 +16,31 @@ from numpy.typing import NDArray
 
 from softmode.checks import require_choice
 from softmode.envs.robots import Robot, with_robot
+from softmode.envs.task import Task
 from softmode.envs.task_config import ObservationType, TaskConfig
 from softmode.errors import ConfigError
 from softmode.objects.config import ObjectConfig
 
 CONTROL_MODES = ("pose_delta", "joint_delta")
 RENDER_MODES = ("rgb_array",)
+
+TaskT = TypeVar("TaskT", bound=Task)
+
+
+class TaskEnv(Generic[TaskT]):
+    """What environments of one world and of many are both: those of the task in brackets, ``SoftEnv[LiftSoft]``."""
+
+    metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 30}  # noqa: RUF012  (gymnasium's convention)
+    task_class: ClassVar[type[Task]] = Task
+    """The task."""
+    config: Any
+    """Configuration of the task."""
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Take the task from the brackets."""
+        super().__init_subclass__(**options)
+        arguments = (kind for base in cls.__dict__.get("__orig_bases__", ()) for kind in get_args(base))
+        cls.task_class = next((kind for kind in arguments if isinstance(kind, type)), cls.task_class)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from softmode.deformables.reduction.body_modes import surface_modes
 from softmode.envs.reward_kernels import TOUCH_FORCE
-from softmode.envs.scripted_base import Environment, ScriptedPolicy, Vector, bounded
+from softmode.envs.scripted import Environment, ScriptedPolicy, Vector, bounded
 from softmode.errors import GraspError
 from softmode.objects.soft_object import SoftObject
 from softmode.robots.grasp_planner import Grasp, plan_grasps

@@ -4,9 +4,9 @@ from enum import IntEnum
 
 import warp as wp
 
-from softmode.envs.end_reason import EndReason
 from softmode.envs.reward_kernels import (
     NEAR,
+    EndReason,
     StepResult,
     WorldState,
     count_held,
@@ -24,28 +24,14 @@ Metric = IntEnum("Metric", "object_height bin_distance others_inside", start=0)
 
 
 @wp.struct
-class Drawn:
-    """Columns of the parameters."""
-
-    scale: int
-
-
-@wp.struct
-class Columns:
-    """Columns of the observation."""
-
-    goal: int
-    goal_offset: int
-    object_goal: int
-
-
-@wp.struct
 class Plan:
     """Columns, the bin and the toys that are to lie in it, and when the goal is met."""
 
-    drawn: Drawn
-    columns: Columns
-    other_offsets: int  # column of the observation; zero where there are no others
+    drawn_scale: int
+    column_goal: int
+    column_goal_offset: int
+    column_object_goal: int
+    column_other_offsets: int  # column of the observation; zero where there are no others
     rim: wp.vec3  # centre of the bin's opening [m]
     half: wp.vec2  # half of its inner edges [m]
     margin: float  # of the part of the bin over which to lower the object, from its walls [m]
@@ -89,9 +75,9 @@ def observe(state: WorldState, plan: Plan, result: StepResult):
     w = wp.tid()
     rim = plan.rim
     x = state.object_position[w, 0]
-    write(result.observation, w, plan.columns.goal, rim)
-    write(result.observation, w, plan.columns.goal_offset, rim - tool_position(state, w))
-    write(result.observation, w, plan.columns.object_goal, rim - x)
+    write(result.observation, w, plan.column_goal, rim)
+    write(result.observation, w, plan.column_goal_offset, rim - tool_position(state, w))
+    write(result.observation, w, plan.column_object_goal, rim - x)
     toy = toy_at_hand(state, plan, w)
     inside = float(0.0)
     for o in range(state.stride):
@@ -99,7 +85,7 @@ def observe(state: WorldState, plan: Plan, result: StepResult):
         if o != toy and is_there(state, w, o) and inside_bin(plan, other):
             inside += 1.0
         if o >= state.slots:
-            write(result.observation, w, plan.other_offsets + 3 * (o - state.slots), other - x)
+            write(result.observation, w, plan.column_other_offsets + 3 * (o - state.slots), other - x)
     now = state.object_position[w, toy]
     result.metrics[w, Metric.object_height] = now[2]
     result.metrics[w, Metric.bin_distance] = beyond(now, rim, plan.half)
@@ -111,7 +97,7 @@ def add_toy(state: WorldState, plan: Plan, w: int, o: int, share: float, result:
     """Add a toy's share of the reward for grasping, lifting, carrying, lowering and letting go."""
     rim = plan.rim
     x = state.object_position[w, o]
-    size = state.parameters[w, plan.drawn.scale]
+    size = state.parameters[w, plan.drawn_scale]
     distance = wp.length(x - tool_position(state, w))
     inside = inside_bin(plan, x)
     # fingers may feel another object: only near this one they hold it
