@@ -138,7 +138,7 @@ class RobotDescription:
     @property
     def model(self) -> Any:
         """The robot as MuJoCo compiles it, one for all that ask: not to be changed."""
-        return _compiled(self.mjcf)
+        return compiled(self.mjcf)
 
     @property
     def home_joint_q(self) -> np.ndarray:
@@ -356,7 +356,7 @@ class RobotIndices:
 
 
 @functools.lru_cache(8)
-def _compiled(mjcf: str) -> Any:
+def compiled(mjcf: str) -> Any:
     """Return the compiled model of a robot."""
     with mujoco_warnings():
         return importlib.import_module("mujoco").MjModel.from_xml_string(mjcf)

@@ -19,7 +19,7 @@ from softmode.robots.arm import ArmDescription, ArmIndices, GripperDescription
 from softmode.robots.chain import SerialChain, serial_chain
 from softmode.robots.description import RobotDescription, RobotIndices
 from softmode.robots.hand import settled
-from softmode.robots.jaws import ParallelJaw, dry_friction_of, finger_names, gap_of
+from softmode.robots.jaws import ParallelJaw, dry_friction_of, finger_names, gap_of, measured
 
 Array = NDArray[np.float64]
 
@@ -45,6 +45,8 @@ _BENT = ((0.0, -1.0, 1.0, -1.0, -1.0, 0.0), (0.0, -1.0, -1.0, 1.0, 1.0, 0.0), (0
 """Poses in which the search begins, in quarters of the ranges of the joints: shoulder, elbow and wrist bent."""
 _ROOM = 0.1
 """How far every joint of the home pose should be from the ends of its range [rad]."""
+_STEP = 0.01
+"""Least time constant, damping over stiffness, of a drive that is stiffened [s]: a step of the simulation."""
 _STUCK = 0.5e-3
 """How far dry friction of its joints may hold a finger from where its drive aims [m]."""
 
@@ -94,8 +96,8 @@ class TableRobot:
 
     @property
     def chain(self) -> SerialChain:
-        """The chain to the frame of tasks, in the base frame."""
-        return serial_chain(self.robot, self.jaw.frame)
+        """The chain to the frame of tasks, in the base frame, with the opening of the home pose."""
+        return serial_chain(self.robot, self.jaw.frame_at(self.home_opening))
 
     @property
     def joint_count(self) -> int:
@@ -237,8 +239,9 @@ def place_robot(
             f"robot {robot.name!r} has no gripper, which this task needs",
             hint="name its joints: load(..., gripper={'joint': (closed, open)}), or give it a hand: load(..., hand=)",
         )
-    jaw = ParallelJaw.of(robot)
-    chain = serial_chain(robot, jaw.frame)
+    robot, jaw = measured(robot)
+    home_opening = min(home_opening, jaw.opening)
+    chain = serial_chain(robot, jaw.frame_at(home_opening))
     if not 5 <= len(chain.joints) <= JOINT_MAX:
         raise ConfigError(
             f"robot {robot.name!r} has {len(chain.joints)} joints between base and tool, expected 5 to {JOINT_MAX}",
@@ -253,7 +256,7 @@ def place_robot(
     # The fingers may change sides: half a turn about the tool, which may free the last joint's range.
     half = Rotation.from_quat(jaw.frame[3:]) * Rotation.from_rotvec([0.0, 0.0, np.pi])
     other = (*jaw.frame[:3], *half.as_quat().tolist())
-    jaws = [jaw, replace(jaw, frame=other)]
+    jaws = [jaw, replace(jaw, frame=other, follow=-jaw.follow)]
     bases = [[tuple(map(float, base))]] if base is not None else [_bases(chain, over, up) for up in _HEIGHTS]
     best: tuple[float, ParallelJaw, Any, Array] | None = None
     home = np.array(home_position, float)
@@ -265,7 +268,7 @@ def place_robot(
         points = np.concatenate([np.array([home] * 3), places, np.reshape(np.array(also, float), (-1, 3))])
         yaw = np.array([0.0, _YAW, -_YAW] + [0.0] * (len(points) - 3))
         for some in bases:
-            found = [_placed(robot, one, some, points, yaw) for one in jaws]
+            found = [_placed(robot, one, home_opening, some, points, yaw) for one in jaws]
             found = [one for one in found if one is not None]
             if found:
                 _, chosen, placed, q = min(found, key=lambda one: one[0])
@@ -338,7 +341,8 @@ def _with_grip(
     if way is not None:
         wanted = max(force / way, friction / _STUCK) * lever**2 / shared
         inertia = robot.joint_inertias()[index]
-        critical = 2.0 * np.sqrt(np.maximum(wanted, stiffness) * inertia)
+        # A finger that weighs little has a drive faster than a step of the simulation: damping keeps it stable.
+        critical = np.maximum(2.0 * np.sqrt(np.maximum(wanted, stiffness) * inertia), _STEP * wanted)
         damping = np.where(wanted > stiffness, np.maximum(damping, critical), damping)
         stiffness = np.maximum(stiffness, wanted)
     changed = list(robot.drives)
@@ -351,14 +355,14 @@ def _with_grip(
 
 
 def _placed(
-    robot: RobotDescription, jaw: ParallelJaw, bases: list[Any], points: Array, yaw: Array
+    robot: RobotDescription, jaw: ParallelJaw, opening: float, bases: list[Any], points: Array, yaw: Array
 ) -> tuple[float, ParallelJaw, Any, Array] | None:
     """Return how far from home, the jaw, the base, and the coordinates over the first point; None if none reaches all.
 
     The middle of the distances that serve is taken, in the direction that asks for the least change of the home pose
     and leaves the last joint room to turn the tool.
     """
-    chain = serial_chain(robot, jaw.frame)
+    chain = serial_chain(robot, jaw.frame_at(opening))
     at_home, error = _reach(chain, np.array(bases), np.tile(points[0], (len(bases), 1)), yaw[:1], chain.home, bent=True)
     reached = error <= _NEAR
     for some in (slice(3, None), slice(1, 3)):  # the places are what most bases do not reach
