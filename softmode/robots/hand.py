@@ -102,7 +102,7 @@ def _found(robot: Compiled, drives: Sequence[JointDrive | None]) -> tuple[str, s
     for palm in _above(model, last):
         joints = _limited(robot, drives, palm)
         longest = max((depth[b] - depth[palm] for b in robot.behind(palm)), default=0)
-        fingers = {_branch(model, palm, j) for j in joints}
+        fingers = {branch(model, palm, j) for j in joints}
         if len(fingers) < 2 or longest > (2 if len(fingers) == 2 else 5):
             continue
         if closing_ends(robot, drives, robot.home(None), palm, joints):
@@ -145,7 +145,7 @@ def find_gripper(
         joints = _limited(robot, drives, palm)
     if not joints:
         return {}, link, []
-    while len(inner := {_branch(model, palm, j) for j in joints}) == 1 and not model.body_jntnum[min(inner)]:
+    while len(inner := {branch(model, palm, j) for j in joints}) == 1 and not model.body_jntnum[min(inner)]:
         palm = min(inner)  # a mount between them
     ends = closing_ends(robot, drives, start, palm, joints)
     left = [repr(robot.joint_names[j]) for j in joints if j not in ends]
@@ -163,7 +163,7 @@ def closing_ends(
     """
     model = robot.model
     owner, ratio, shift = robot.ties
-    fingers = {b: side_of(model, palm, b) for b in sorted({_branch(model, palm, j) for j in joints})}
+    fingers = {b: side_of(model, palm, b) for b in sorted({branch(model, palm, j) for j in joints})}
     moved = {b for side in fingers.values() for b in side}
     rest = [palm, *(b for b in robot.behind(palm) if b not in moved and _fixed_to(model, b, palm))]
     ends: dict[int, tuple[float, float]] = {}
@@ -183,7 +183,7 @@ def closing_ends(
         sides = opposed(posed(j, drive.lower), posed(j, drive.upper), sides)
     for j, drive in driven:
         first = next(i for i in joints if owner[i] == owner[j])
-        own = next(sorted(side) for side in sides if _branch(model, palm, j) in side)
+        own = next(sorted(side) for side in sides if branch(model, palm, j) in side)
         others = [b for side in sides for b in sorted(side) if b not in own]
         # Two fingers close on each other, one on the palm's own jaw, several on the palm.
         towards = others if len(sides) == 2 and others else rest
@@ -293,7 +293,7 @@ def _above(model: Any, link: int) -> list[int]:
     return found
 
 
-def _branch(model: Any, palm: int, joint: int) -> int:
+def branch(model: Any, palm: int, joint: int) -> int:
     """Return the link next to the palm on the way to a joint's link."""
     link = int(model.jnt_bodyid[joint])
     while int(model.body_parentid[link]) != palm:

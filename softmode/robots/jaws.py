@@ -159,12 +159,15 @@ def measured(robot: RobotDescription) -> tuple[RobotDescription, ParallelJaw]:
 @functools.lru_cache(8)
 def _outlines(mjcf: str, links: tuple[int, ...]) -> dict[int, Array]:
     """Return points along the edges of the hulls of shapes of links, in their frames [m]."""
-    model, share = compiled(mjcf), np.linspace(0.0, 1.0, 11)[:, None, None, None]
+    model, share = compiled(mjcf), np.linspace(0.0, 1.0, 11)[1:-1, None, None]
     found = {}
     for geom in colliding(model, links):
-        corners = geom_corners(model, geom)
-        edges = corners[ConvexHull(corners).simplices]
-        found[geom] = ((1.0 - share) * edges + share * np.roll(edges, 1, axis=1)).reshape(-1, 3)
+        hull = ConvexHull(geom_corners(model, geom))
+        pairs = np.concatenate([hull.simplices[:, [0, 1]], hull.simplices[:, [1, 2]], hull.simplices[:, [2, 0]]])
+        first, last = hull.points[np.unique(np.sort(pairs, axis=1), axis=0).T]
+        long = np.linalg.norm(last - first, axis=1) > _FACE
+        between = (1.0 - share) * first[long] + share * last[long]
+        found[geom] = np.concatenate([hull.points[hull.vertices], between.reshape(-1, 3)])
     return found
 
 

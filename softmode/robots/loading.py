@@ -26,8 +26,9 @@ from softmode.foreign.child.model import check_parts, open_spec
 from softmode.foreign.tokens import SUFFIXES
 from softmode.robots.assets import RobotAsset, find, names_file
 from softmode.robots.compiled import CompiledRobot
+from softmode.robots.convex_parts import cut_meshes
 from softmode.robots.description import JointTie, RobotDescription
-from softmode.robots.hand import colliding, find_end_effector
+from softmode.robots.hand import branch, colliding, find_end_effector
 from softmode.robots.joint_split import hold_base, split_links
 from softmode.robots.meshes import use_meshes
 from softmode.robots.references import check_references, default_root, read_xml
@@ -123,6 +124,9 @@ def load(
     jaws, palm = robot.gripper(gripper, drives, start, link)
     behind = sorted({*robot.behind(palm), *robot.behind(link)})
     robot.notes += _let_touch(spec, robot, behind)
+    if jaws is not None and len({branch(robot.model, palm, robot.joint_names.index(name)) for name in jaws.joints}) == 1:
+        rigid = np.flatnonzero(robot.model.body_weldid == robot.model.body_weldid[palm]).tolist()
+        robot.notes += cut_meshes(spec, robot.model, colliding(robot.model, sorted({*behind, *rigid} - {0})))
     for equality in list(spec.equalities):
         if equality.name in robot.dropped:
             spec.delete(equality)

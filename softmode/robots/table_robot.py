@@ -267,7 +267,9 @@ def place_robot(
         places = box.reshape(-1, 3) * [share * ranges[0], share * ranges[1], 1.0] + [*over, 0.0]
         points = np.concatenate([np.array([home] * 3), places, np.reshape(np.array(also, float), (-1, 3))])
         yaw = np.array([0.0, _YAW, -_YAW] + [0.0] * (len(points) - 3))
-        for some in bases:
+        for every in bases:
+            far = np.linalg.norm(points[:, None] - _shoulders(chain, every), axis=2).max(axis=0)
+            some = [one for one, distance in zip(every, far, strict=True) if distance < chain.reach + _NEAR]
             found = [_placed(robot, one, home_opening, some, points, yaw) for one in jaws]
             found = [one for one in found if one is not None]
             if found:
@@ -362,6 +364,8 @@ def _placed(
     The middle of the distances that serve is taken, in the direction that asks for the least change of the home pose
     and leaves the last joint room to turn the tool.
     """
+    if not bases:
+        return None
     chain = serial_chain(robot, jaw.frame_at(opening))
     at_home, error = _reach(chain, np.array(bases), np.tile(points[0], (len(bases), 1)), yaw[:1], chain.home, bent=True)
     reached = error <= _NEAR
@@ -397,6 +401,11 @@ def _bases(chain: SerialChain, over: Sequence[float], up: float) -> list[Any]:
         for turn in ((0.0,) if free else (0.0, 0.5 * math.pi, -0.5 * math.pi, math.pi))
         for share in np.linspace(0.25, 0.95, 15)
     ]
+
+
+def _shoulders(chain: SerialChain, bases: list[Any]) -> Array:
+    """Return where the first joint is with the base at places, shape (N, 3) [m]."""
+    return np.array([one[:3] for one in bases]) + _about_z(np.array(bases)[:, 3]).apply(chain.anchor[0])
 
 
 def _reach(
