@@ -30,6 +30,8 @@ _TIP = 0.01
 """How far behind the tip of a finger a link may end that counts as its pad [m]."""
 _JAW = 0.02
 """How much of the tip of a jaw that turns counts as its pad [m]; it is open where its tip has come up by as much."""
+_DEEP = 0.75
+"""Share of the gap at its tips to which a jaw that turns may narrow where an object reaches into it."""
 _LEAST_OPENING = 0.03
 """Least opening of a hand with one moving jaw that tasks can use [m]."""
 _SLIDE = 2
@@ -219,12 +221,13 @@ def _one_jaw(robot: RobotDescription, sides: tuple[list[int], list[int]]) -> tup
     ends = np.array([gripper.closed, gripper.open])
     ends = ends[0] + np.outer([zero, openings[last]], ends[1] - ends[0])
     jaws = RobotGripper(joints=gripper.joints, closed=tuple(ends[0].tolist()), open=tuple(ends[1].tolist()))
-    usual = poses[int(np.searchsorted(gaps[: last + 1], min(_USUAL, gaps[last]), sorter=None))]
+    at_usual = min(_USUAL, float(gaps[last]))
+    usual = poses[int(np.searchsorted(gaps[: last + 1], at_usual))]
     moving = points(usual, 0) @ turn
     tips = [side[side[:, 2] >= tip - _JAW] for side in (moving, fixed)]
     low, high = np.max([pad.min(0) for pad in tips], axis=0), np.min([pad.max(0) for pad in tips], axis=0)
     depth = np.arange(_JAW, tip - float(closed.xanchor[j] @ z), 0.005)
-    free = [_one_gap(robot, usual, turn, tip - h - 0.0025, tip - h + 0.0025) > 0.5 * _USUAL for h in depth]
+    free = [_one_gap(robot, usual, turn, tip - h - 0.0025, tip - h + 0.0025) > _DEEP * at_usual for h in depth]
     middle = np.array([0.5 * (low[0] + high[0]), tips[1][:, 1].max(), tip - 0.5 * _JAW])
     tool = Rotation.from_matrix(mount) * Rotation.from_quat(robot.tool[3:])
     origin = closed.xpos[link] + mount @ np.array(robot.tool[:3])

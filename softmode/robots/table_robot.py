@@ -46,7 +46,7 @@ _BENT = ((0.0, -1.0, 1.0, -1.0, -1.0, 0.0), (0.0, -1.0, -1.0, 1.0, 1.0, 0.0), (0
 _ROOM = 0.1
 """How far every joint of the home pose should be from the ends of its range [rad]."""
 _STEP = 0.01
-"""Least time constant, damping over stiffness, of a drive that is stiffened [s]: a step of the simulation."""
+"""A step of the simulation, in which a drive must not swing [s]."""
 _STUCK = 0.5e-3
 """How far dry friction of its joints may hold a finger from where its drive aims [m]."""
 
@@ -297,7 +297,7 @@ def place_robot(
     robot = replace(robot, home=tuple(home.tolist()))
     travel = 0.5 * float(gaps[-1] - gaps[0])
     friction = 0.5 * dry_friction_of(robot) / travel
-    robot, force, stiffness = _with_grip(robot, travel, friction, grip_force, grip_way)
+    robot, force, stiffness = _with_grip(_steady(robot), travel, friction, grip_force, grip_way)
     return TableRobot(
         robot=robot,
         base=placed,
@@ -343,7 +343,7 @@ def _with_grip(
     if way is not None:
         wanted = max(force / way, friction / _STUCK) * lever**2 / shared
         inertia = robot.joint_inertias()[index]
-        # A finger that weighs little has a drive faster than a step of the simulation: damping keeps it stable.
+        # A finger that weighs little swings within a step of the simulation unless it is damped more.
         critical = np.maximum(2.0 * np.sqrt(np.maximum(wanted, stiffness) * inertia), _STEP * wanted)
         damping = np.where(wanted > stiffness, np.maximum(damping, critical), damping)
         stiffness = np.maximum(stiffness, wanted)
@@ -354,6 +354,16 @@ def _with_grip(
         changed[j] = replace(drives[k], **new)
     along = float((stiffness / lever**2).sum() / 2.0)
     return replace(robot, drives=tuple(changed)), force, along
+
+
+def _steady(robot: RobotDescription) -> RobotDescription:
+    """Return the robot with softer drives where they would swing within a step of the simulation."""
+    drives = list(robot.drives)
+    for j, (drive, inertia) in enumerate(zip(drives, robot.joint_inertias(), strict=True)):
+        if drive is not None and drive.stiffness * _STEP**2 > inertia and drive.damping < drive.stiffness * _STEP:
+            stiffness = 0.25 * float(inertia) / _STEP**2
+            drives[j] = replace(drive, stiffness=stiffness, damping=stiffness * _STEP)
+    return replace(robot, drives=tuple(drives))
 
 
 def _placed(
