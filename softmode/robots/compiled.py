@@ -24,7 +24,7 @@ import numpy as np
 from softmode.deformables.coupling.rigid_solver import mujoco_warnings
 from softmode.errors import AssetError, ConfigError
 from softmode.robots.assets import RobotAsset
-from softmode.robots.description import JointDrive, RobotGripper, ToolPose
+from softmode.robots.description import JointDrive, RobotGripper, ToolPose, followed
 from softmode.robots.hand import find_end_effector, find_gripper
 
 
@@ -105,22 +105,16 @@ class CompiledRobot:
         """Return the home pose within the joint limits."""
         if given is None:
             values = np.array([self.at_home.get(name, 0.0) for name in self.joint_names]) - self.reference
-            return np.clip(self._followed(np.clip(values, self.lower, self.upper)), self.lower, self.upper)
+            return np.clip(followed(np.clip(values, self.lower, self.upper), *self.bound), self.lower, self.upper)
         values = np.asarray(given, float)
         if values.shape != (len(self.joint_names),) or not np.all(np.isfinite(values)):
             hint = f"give one number for each of {', '.join(self.joint_names)}"
             raise ConfigError(f"home has shape {values.shape} or holds a value that is not finite", hint=hint)
-        followed = self._followed(values)
-        for j in np.flatnonzero(np.abs(followed - values) > 1.0e-6):
+        tied = followed(values, *self.bound)
+        for j in np.flatnonzero(np.abs(tied - values) > 1.0e-6):
             leader = self.joint_names[self.bound[0][j]]
-            self.notes.append(f"home: {self.joint_names[j]!r} follows {leader!r}, so it is {followed[j]:.4g}")
-        return followed
-
-    def _followed(self, joint_q: np.ndarray) -> np.ndarray:
-        """Return coordinates whose followers are where the file's ties have them."""
-        owner, ratio, shift = self.bound
-        moved = np.array(shift) + np.array(ratio) * joint_q[owner]
-        return np.where(np.array(owner) == np.arange(len(owner)), joint_q, moved)
+            self.notes.append(f"home: {self.joint_names[j]!r} follows {leader!r}, so it is {tied[j]:.4g}")
+        return tied
 
     def data(self, joint_q: np.ndarray) -> Any:
         """Return the kinematics at a pose."""
@@ -326,7 +320,7 @@ class CompiledRobot:
             poses.append(np.where(hinge, np.clip(0.25 * math.pi, 0.75 * low + 0.25 * high, high), 0.0))
         masses = np.zeros((len(poses), self.model.nv, self.model.nv))
         for mass, pose in zip(masses, poses, strict=True):
-            self.mujoco.mj_fullM(self.model, self.data(self._followed(pose)), mass)
+            self.mujoco.mj_fullM(self.model, self.data(followed(pose, *self.bound)), mass)
         return masses.diagonal(axis1=1, axis2=2).max(axis=0)
 
     def _default_drive(self, j: int, limit: float) -> JointDrive:

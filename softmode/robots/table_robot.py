@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -37,6 +38,12 @@ _SHARES = (1.0, 0.75, 0.5, 0.3)
 """Shares of the ranges that are tried in turn."""
 _HEIGHTS = (0.0, 0.15, 0.3, 0.45)
 """How high above the table the base is tried, in turn [m]."""
+_POSES = 20000
+"""Most poses that a search for a base tries: about 2 s on a laptop."""
+_FIRST = 25
+"""Steps of the inverse kinematics after which a pose is given up that is farther off than `_HOPE`."""
+_HOPE = 0.1
+"""See `_FIRST` [m]."""
 _FREE = 5.7
 """Range of an upright first joint from which on the base needs not be turned [rad]."""
 _LOW = 0.13
@@ -49,6 +56,14 @@ _STEP = 0.01
 """A step of the simulation, in which a drive must not swing [s]."""
 _STUCK = 0.5e-3
 """How far dry friction of its joints may hold a finger from where its drive aims [m]."""
+
+
+@dataclass
+class _Search:
+    """What a search may still do: its work is bounded, not its time, so that all machines find the same."""
+
+    left: int = _POSES
+    """Poses to be tried yet."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,7 +161,7 @@ class TableRobot:
         """
         chain = self.chain
         start = np.array(self.robot.home)[list(chain.joints)]
-        q, error = _reach(chain, np.array([self.base]), np.array([position], float), np.array([yaw]), start)
+        q, error = _reach(chain, np.array([self.base]), np.array([position], float), np.array([yaw]), start, _Search())
         if error[0] > _NEAR:
             raise ConfigError(
                 f"robot {self.robot.name!r} cannot hold its tool at {tuple(position)} m pointing down with yaw {yaw}",
@@ -258,34 +273,33 @@ def place_robot(
     other = (*jaw.frame[:3], *half.as_quat().tolist())
     jaws = [jaw, replace(jaw, frame=other, follow=-jaw.follow)]
     bases = [[tuple(map(float, base))]] if base is not None else [_bases(chain, over, up) for up in _HEIGHTS]
-    best: tuple[float, ParallelJaw, Any, Array] | None = None
-    home = np.array(home_position, float)
-    for share in _SHARES:
+    best: tuple[float, ParallelJaw, Any, Array, list[float]] | None = None
+    search = _Search()
+    for share, every in itertools.product(_SHARES, bases):
+        home = np.array(home_position, float)
         if share < 1.0:
             home[2] = max(share * home_position[2], min(home_position[2], _LOW))
         box = np.stack(np.meshgrid([-1.0, 1.0], [-1.0, 1.0], [0.02, max(share * height, home[2])], indexing="ij"), -1)
         places = box.reshape(-1, 3) * [share * ranges[0], share * ranges[1], 1.0] + [*over, 0.0]
         points = np.concatenate([np.array([home] * 3), places, np.reshape(np.array(also, float), (-1, 3))])
         yaw = np.array([0.0, _YAW, -_YAW] + [0.0] * (len(points) - 3))
-        for every in bases:
-            far = np.linalg.norm(points[:, None] - _shoulders(chain, every), axis=2).max(axis=0)
-            some = [one for one, distance in zip(every, far, strict=True) if distance < chain.reach + _NEAR]
-            found = [_placed(robot, one, home_opening, some, points, yaw) for one in jaws]
-            found = [one for one in found if one is not None]
-            if found:
-                _, chosen, placed, q = min(found, key=lambda one: one[0])
-                best = share, chosen, placed, q
-                break
-        if best is not None:
+        far = np.linalg.norm(points[:, None] - _shoulders(chain, every), axis=2).max(axis=0)
+        some = [one for one, distance in zip(every, far, strict=True) if distance < chain.reach + _NEAR]
+        found = [_placed(robot, one, home_opening, some, points, yaw, search) for one in jaws]
+        found = [one for one in found if one is not None]
+        if found:
+            _, chosen, placed, q = min(found, key=lambda one: one[0])
+            best = share, chosen, placed, q, home.tolist()
+        if found or search.left <= 0:
             break
     if best is None:
+        spent = f", in the {_POSES} poses that are tried" if search.left <= 0 else ""
         raise ConfigError(
             f"robot {robot.name!r}, whose tool reaches {chain.reach:.2f} m, finds no place from which it points down "
-            f"at {tuple(home_position)} m and around {tuple(over)} m",
+            f"at {tuple(home_position)} m, turned by {_YAW} rad to either side, and around {tuple(over)} m{spent}",
             hint="use a larger robot, a lower home_position, or name its tool: load(..., end_effector=, tool_offset=)",
         )
-    share, jaw, placed, q = best
-    home_position = home.tolist()
+    share, jaw, placed, q, home_position = best
     gaps = np.maximum.accumulate([gap_of(robot, jaw, s) for s in np.linspace(0.0, 1.0, _OPENINGS)])
     gaps = np.maximum(gaps, 0.0) + 1.0e-7 * np.arange(_OPENINGS)  # ascending
     jaw = replace(jaw, opening=float(gaps[-1]))
@@ -367,7 +381,13 @@ def _steady(robot: RobotDescription) -> RobotDescription:
 
 
 def _placed(
-    robot: RobotDescription, jaw: ParallelJaw, opening: float, bases: list[Any], points: Array, yaw: Array
+    robot: RobotDescription,
+    jaw: ParallelJaw,
+    opening: float,
+    bases: list[Any],
+    points: Array,
+    yaw: Array,
+    search: _Search,
 ) -> tuple[float, ParallelJaw, Any, Array] | None:
     """Return how far from home, the jaw, the base, and the coordinates over the first point; None if none reaches all.
 
@@ -377,7 +397,8 @@ def _placed(
     if not bases:
         return None
     chain = serial_chain(robot, jaw.frame_at(opening))
-    at_home, error = _reach(chain, np.array(bases), np.tile(points[0], (len(bases), 1)), yaw[:1], chain.home, bent=True)
+    over_home = np.tile(points[0], (len(bases), 1))
+    at_home, error = _reach(chain, np.array(bases), over_home, yaw[:1], chain.home, search, bent=True)
     reached = error <= _NEAR
     for some in (slice(3, None), slice(1, 3)):  # the places are what most bases do not reach
         left = np.flatnonzero(reached)
@@ -386,7 +407,7 @@ def _placed(
         count = len(points[some])
         rows, turns = np.tile(points[some], (len(left), 1)), np.tile(yaw[some], len(left))
         starts = np.repeat(at_home[left], count, axis=0)
-        _, error = _reach(chain, np.repeat(np.array(bases)[left], count, axis=0), rows, turns, starts)
+        _, error = _reach(chain, np.repeat(np.array(bases)[left], count, axis=0), rows, turns, starts, search)
         reached[left] = (error.reshape(-1, count) <= _NEAR).all(axis=1)
     middles = []
     for turn in dict.fromkeys(one[3] for one in bases):
@@ -419,7 +440,7 @@ def _shoulders(chain: SerialChain, bases: list[Any]) -> Array:
 
 
 def _reach(
-    chain: SerialChain, base: Array, points: Array, yaw: Array, start: Array, *, bent: bool = False
+    chain: SerialChain, base: Array, points: Array, yaw: Array, start: Array, search: _Search, *, bent: bool = False
 ) -> tuple[Array, Array]:
     """Return coordinates that hold the tool at points of the world, pointing down, and what is missing [m].
 
@@ -432,6 +453,7 @@ def _reach(
         points: The points, shape (N, 3).
         yaw: Rotation of the tool about the vertical there [rad], shape (N,).
         start: The home pose, shape (n,) or (N, n).
+        search: What may still be tried.
         bent: Whether more poses are tried: with the elbow up, down and to the sides.
     """
     base, yaw = np.broadcast_to(base, (len(points), 4)), np.broadcast_to(yaw, len(points))
@@ -445,7 +467,10 @@ def _reach(
         starts += [middle + quarter * np.resize(signs, len(low)) for signs in _BENT]
 
     def solved(rows: NDArray[np.int64], begin: Array) -> tuple[Array, Array]:
-        q, error = chain.inverse(local[rows], turns[rows], begin, iterations=80)
+        search.left -= len(rows)
+        q, error = chain.inverse(local[rows], turns[rows], begin, iterations=_FIRST)
+        near = np.flatnonzero(error < _HOPE)  # what is far off by then stays there
+        q[near], error[near] = chain.inverse(local[rows[near]], turns[rows[near]], q[near], iterations=80 - _FIRST)
         return q, np.where(chain.lowest(q) + base[rows, 2] < 0.0, np.inf, error)
 
     def ranked(q: Array, error: Array) -> Array:
@@ -456,7 +481,7 @@ def _reach(
     for other in starts:
         rank = ranked(q, error)
         left = np.flatnonzero(rank > _NEAR)
-        if not len(left):
+        if not len(left) or search.left <= 0:
             break
         again, missing = solved(left, other)
         better = ranked(again, missing) < rank[left]
