@@ -38,11 +38,11 @@ _SHARES = (1.0, 0.75, 0.5, 0.3)
 """Shares of the ranges that are tried in turn."""
 _HEIGHTS = (0.0, 0.15, 0.3, 0.45)
 """How high above the table the base is tried, in turn [m]."""
-_POSES = 20000
+_POSES = 4000
 """Most poses that a search for a base tries: about 2 s on a laptop."""
 _FIRST = 25
 """Steps of the inverse kinematics after which a pose is given up that is farther off than `_HOPE`."""
-_HOPE = 0.1
+_HOPE = 0.03
 """See `_FIRST` [m]."""
 _FREE = 5.7
 """Range of an upright first joint from which on the base needs not be turned [rad]."""
@@ -159,15 +159,24 @@ class TableRobot:
         Raises:
             ConfigError: If the point is out of reach.
         """
-        chain = self.chain
-        start = np.array(self.robot.home)[list(chain.joints)]
-        q, error = _reach(chain, np.array([self.base]), np.array([position], float), np.array([yaw]), start, _Search())
+        q, error = self._held(np.array([position], float), yaw)
         if error[0] > _NEAR:
             raise ConfigError(
                 f"robot {self.robot.name!r} cannot hold its tool at {tuple(position)} m pointing down with yaw {yaw}",
                 hint="choose a point nearer to its base, or place it anew: softmode.robots.place_robot(robot, ...)",
             )
         return q[0]
+
+    def turn_at(self, positions: Array, yaw: float) -> float | None:
+        """Return a yaw, or the one half a turn away, with which the tool gets to points, (N, 3) [m]; None if neither."""
+        turns = (yaw, yaw - math.copysign(math.pi, yaw))
+        return next((turn for turn in turns if (self._held(positions, turn)[1] <= _NEAR).all()), None)
+
+    def _held(self, positions: Array, yaw: float) -> tuple[Array, Array]:
+        """Return coordinates that hold the tool at points, pointing down with a yaw, and what is missing [m]."""
+        chain = self.chain
+        start = np.array(self.robot.home)[list(chain.joints)]
+        return _reach(chain, np.array([self.base]), positions, np.full(len(positions), yaw), start, _Search())
 
     def add_to(
         self, builder: newton.ModelBuilder, *, xform: Sequence[float] | None = None, label: str = "arm"
@@ -281,11 +290,10 @@ def place_robot(
             home[2] = max(share * home_position[2], min(home_position[2], _LOW))
         box = np.stack(np.meshgrid([-1.0, 1.0], [-1.0, 1.0], [0.02, max(share * height, home[2])], indexing="ij"), -1)
         places = box.reshape(-1, 3) * [share * ranges[0], share * ranges[1], 1.0] + [*over, 0.0]
-        points = np.concatenate([np.array([home] * 3), places, np.reshape(np.array(also, float), (-1, 3))])
-        yaw = np.array([0.0, _YAW, -_YAW] + [0.0] * (len(points) - 3))
+        points = np.concatenate([home[None], places, np.reshape(np.array(also, float), (-1, 3))])
         far = np.linalg.norm(points[:, None] - _shoulders(chain, every), axis=2).max(axis=0)
         some = [one for one, distance in zip(every, far, strict=True) if distance < chain.reach + _NEAR]
-        found = [_placed(robot, one, home_opening, some, points, yaw, search) for one in jaws]
+        found = [_placed(robot, one, home_opening, some, points, search) for one in jaws]
         found = [one for one in found if one is not None]
         if found:
             _, chosen, placed, q = min(found, key=lambda one: one[0])
@@ -386,7 +394,6 @@ def _placed(
     opening: float,
     bases: list[Any],
     points: Array,
-    yaw: Array,
     search: _Search,
 ) -> tuple[float, ParallelJaw, Any, Array] | None:
     """Return how far from home, the jaw, the base, and the coordinates over the first point; None if none reaches all.
@@ -397,18 +404,22 @@ def _placed(
     if not bases:
         return None
     chain = serial_chain(robot, jaw.frame_at(opening))
-    over_home = np.tile(points[0], (len(bases), 1))
-    at_home, error = _reach(chain, np.array(bases), over_home, yaw[:1], chain.home, search, bent=True)
+    places, over_home = np.array(bases), np.tile(points[0], (len(bases), 1))
+    at_home, error = _reach(chain, places, over_home, np.zeros(1), chain.home, search, bent=True)
     reached = error <= _NEAR
-    for some in (slice(3, None), slice(1, 3)):  # the places are what most bases do not reach
+    # Opposite corners are what most bases do not reach. Turned by half a turn, the fingers change sides.
+    corners, every, home = points[[1, 6]], points[1:], points[:1]
+    for some, turns in ((corners, (0.0,)), (every, (0.0,)), (home, (_YAW, _YAW - np.pi)), (home, (-_YAW, np.pi - _YAW))):
         left = np.flatnonzero(reached)
-        if not len(left):
-            return None
-        count = len(points[some])
-        rows, turns = np.tile(points[some], (len(left), 1)), np.tile(yaw[some], len(left))
-        starts = np.repeat(at_home[left], count, axis=0)
-        _, error = _reach(chain, np.repeat(np.array(bases)[left], count, axis=0), rows, turns, starts, search)
-        reached[left] = (error.reshape(-1, count) <= _NEAR).all(axis=1)
+        reached[left] = False
+        for turn in turns:
+            left = left[~reached[left]]
+            if not len(left):
+                break
+            base, start = (np.repeat(rows[left], len(some), axis=0) for rows in (places, at_home))
+            rows = np.tile(some, (len(left), 1))
+            _, error = _reach(chain, base, rows, np.full(len(rows), turn), start, search)
+            reached[left] = (error.reshape(-1, len(some)) <= _NEAR).all(axis=1)
     middles = []
     for turn in dict.fromkeys(one[3] for one in bases):
         chosen = [k for k in np.flatnonzero(reached) if bases[k][3] == turn]
@@ -426,10 +437,13 @@ def _bases(chain: SerialChain, over: Sequence[float], up: float) -> list[Any]:
     """Return places of the base: at a height, at several distances on the near side, turned by quarter turns."""
     low, high = chain.span
     # The first joint of most arms turns the base by itself.
-    free = abs(chain.axis[0, 2]) > 0.99 and not chain.slide[0] and high[0] - low[0] > _FREE
+    upright = abs(chain.axis[0, 2]) > 0.99 and not chain.slide[0]
+    free = upright and high[0] - low[0] > _FREE
+    turns = (0.0,) if free else (0.0, 0.5 * math.pi, -0.5 * math.pi, math.pi)
+    aside = _about_z(np.array(turns)).apply(chain.anchor[0] if upright else np.zeros(3))  # from the base to its axis
     return [
-        (float(over[0] - share * chain.reach), float(over[1]), up, turn)
-        for turn in ((0.0,) if free else (0.0, 0.5 * math.pi, -0.5 * math.pi, math.pi))
+        (float(over[0] - share * chain.reach - x), float(over[1] - y), up, turn)
+        for turn, (x, y, _) in zip(turns, aside, strict=True)
         for share in np.linspace(0.25, 0.95, 15)
     ]
 
