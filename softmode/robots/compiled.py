@@ -27,6 +27,11 @@ from softmode.robots.assets import RobotAsset
 from softmode.robots.description import JointDrive, RobotGripper, ToolPose, followed
 from softmode.robots.hand import find_end_effector, find_gripper
 
+_HELD_OFF = 0.02
+"""How far dry friction may hold a joint without servo from its target [rad or m]."""
+_LEAST_LAG = 0.01
+"""Least damping of such a drive over its stiffness [s], with which a step of the simulation resolves it."""
+
 
 @dataclass
 class CompiledRobot:
@@ -214,6 +219,8 @@ class CompiledRobot:
                 self.notes.append(f"the drive of joint {name!r} has force limit 0: it does not move it")
         # A tie between driven joints is what their drives replace; one between passive joints stays.
         loops = (int(self.mujoco.mjtEq.mjEQ_CONNECT), int(self.mujoco.mjtEq.mjEQ_WELD))
+        if any(int(kind) in loops for kind in model.eq_type):
+            self.notes.append("loops are held by rows that give a little: a slider-crank passes on .990 of its force")
         for e in range(model.neq):
             name, tie = model.equality(e).name, self._tie(e)
             if tie is None and int(model.eq_type[e]) not in loops:
@@ -326,10 +333,11 @@ class CompiledRobot:
     def _default_drive(self, j: int, limit: float) -> JointDrive:
         """Return a critically damped drive for a joint without servo."""
         mass, omega, loss = self._inertias[j], 2.0 * math.pi * self.bandwidth, self.model.dof_damping[j]
+        # Against much viscous friction the joint would creep to its target; dry friction would hold it away from it.
+        stiffness = float(max(mass * omega**2, 0.5 * loss * omega, self.model.dof_frictionloss[j] / _HELD_OFF))
         return JointDrive(
-            # Against much viscous friction the joint would creep to its target.
-            stiffness=float(max(mass * omega**2, 0.5 * loss * omega)),
-            damping=float(max(2.0 * mass * omega - loss, 0.0)),
+            stiffness=stiffness,
+            damping=float(max(2.0 * mass * omega - loss, _LEAST_LAG * stiffness - loss, 0.0)),
             effort_limit=limit,
             lower=float(self.lower[j]),
             upper=float(self.upper[j]),

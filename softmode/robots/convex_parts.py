@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 
 _SLABS = 8
 """Into how many slabs a mesh is cut across its longest axis."""
-_FILLED = 0.8
+_FILLED = 0.9
 """Share of its hull's volume that the hulls of the slabs fill at most where a mesh is cut."""
 
 

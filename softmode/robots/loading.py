@@ -123,16 +123,17 @@ def load(
     link, tool = robot.tool(end_effector, np.array(offset), drives)
     jaws, palm = robot.gripper(gripper, drives, start, link)
     behind = sorted({*robot.behind(palm), *robot.behind(link)})
-    robot.notes += _let_touch(spec, robot, behind)
+    changed = _let_touch(spec, robot, behind)
     if jaws is not None and len({branch(robot.model, palm, robot.joint_names.index(name)) for name in jaws.joints}) == 1:
         rigid = np.flatnonzero(robot.model.body_weldid == robot.model.body_weldid[palm]).tolist()
-        robot.notes += cut_meshes(spec, robot.model, colliding(robot.model, sorted({*behind, *rigid} - {0})))
+        changed += cut_meshes(spec, robot.model, colliding(robot.model, sorted({*behind, *rigid} - {0})))
     for equality in list(spec.equalities):
         if equality.name in robot.dropped:
             spec.delete(equality)
     for actuator in list(spec.actuators):
         spec.delete(actuator)
-    final = _compile(spec, asset)
+    robot.notes += changed
+    final = _compile(spec, asset) if changed else robot.model
     return RobotDescription(
         name=asset.name,
         path=asset.path,

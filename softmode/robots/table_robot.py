@@ -381,8 +381,11 @@ def _with_grip(
 def _steady(robot: RobotDescription) -> RobotDescription:
     """Return the robot with softer drives where they would swing within a step of the simulation."""
     drives = list(robot.drives)
-    for j, (drive, inertia) in enumerate(zip(drives, robot.joint_inertias(), strict=True)):
-        if drive is not None and drive.stiffness * _STEP**2 > inertia and drive.damping < drive.stiffness * _STEP:
+    for j, (drive, inertia, loss) in enumerate(
+        zip(drives, robot.joint_inertias(), robot.model.dof_damping.tolist(), strict=True)
+    ):
+        fast = drive is not None and drive.stiffness * _STEP**2 > inertia
+        if drive is not None and fast and drive.damping + loss < drive.stiffness * _STEP:
             stiffness = 0.25 * float(inertia) / _STEP**2
             drives[j] = replace(drive, stiffness=stiffness, damping=stiffness * _STEP)
     return replace(robot, drives=tuple(drives))
