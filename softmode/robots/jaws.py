@@ -159,25 +159,26 @@ def measured(robot: RobotDescription) -> tuple[RobotDescription, ParallelJaw]:
 
 
 @functools.lru_cache(8)
-def _outlines(mjcf: str, links: tuple[int, ...]) -> dict[int, Array]:
-    """Return points along the edges of the hulls of shapes of links, in their frames [m]."""
-    model, share = compiled(mjcf), np.linspace(0.0, 1.0, 11)[1:-1, None, None]
-    found = {}
-    for geom in colliding(model, links):
-        hull = ConvexHull(geom_corners(model, geom))
-        pairs = np.concatenate([hull.simplices[:, [0, 1]], hull.simplices[:, [1, 2]], hull.simplices[:, [2, 0]]])
-        first, last = hull.points[np.unique(np.sort(pairs, axis=1), axis=0).T]
-        long = np.linalg.norm(last - first, axis=1) > _FACE
-        between = (1.0 - share) * first[long] + share * last[long]
-        found[geom] = np.concatenate([hull.points[hull.vertices], between.reshape(-1, 3)])
-    return found
+def _edges(mjcf: str, links: tuple[int, ...]) -> dict[int, Array]:
+    """Return both ends of the edges of the hulls of shapes of links, in their frames, (2 E, 3) [m]."""
+    model = compiled(mjcf)
+    hulls = {geom: ConvexHull(geom_corners(model, geom)) for geom in colliding(model, links)}
+    return {geom: hull.points[hull.simplices[:, [0, 1, 1, 2, 2, 0]]].reshape(-1, 3) for geom, hull in hulls.items()}
+
+
+def _within(ends: Array, low: float, high: float) -> Array:
+    """Return the corners of what lies of hulls between two heights, by the ends of their edges."""
+    first, last = ends.reshape(-1, 2, 3).swapaxes(0, 1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = (np.array([[low], [high]]) - first[:, 2]) / (last - first)[:, 2]
+    points = first + np.nan_to_num(np.clip(share, 0.0, 1.0))[..., None] * (last - first)
+    return points[(points[..., 2] >= low - 1e-9) & (points[..., 2] <= high + 1e-9)]
 
 
 def _one_gap(robot: RobotDescription, data: Any, turn: Array, low: float, high: float = np.inf) -> float:
     """Return the gap between a jaw and the fixed one, moving less fixed along y of a frame, in a slab of z [m]."""
     sides = _fingers(robot, robot.model)
-    points = [in_world(data, _outlines(robot.mjcf, tuple(side))) @ turn for side in sides]
-    jaw, fixed = (side[(side[:, 2] >= low) & (side[:, 2] <= high), 1] for side in points)
+    jaw, fixed = (_within(in_world(data, _edges(robot.mjcf, tuple(side))) @ turn, low, high)[:, 1] for side in sides)
     if not len(jaw) or not len(fixed):
         return -np.inf
     # y may point from either one to the other
@@ -196,7 +197,7 @@ def _one_jaw(robot: RobotDescription, sides: tuple[list[int], list[int]]) -> tup
     mount = closed.xmat[link].reshape(3, 3)
 
     def points(data: Any, k: int) -> Array:
-        return in_world(data, _outlines(robot.mjcf, tuple(sides[k])))
+        return in_world(data, _edges(robot.mjcf, tuple(sides[k])))
 
     along = points(closed, 0).mean(0) - closed.xanchor[j]
     along = mount.T @ (along - axis * (along @ axis))
@@ -224,7 +225,7 @@ def _one_jaw(robot: RobotDescription, sides: tuple[list[int], list[int]]) -> tup
     at_usual = min(_USUAL, float(gaps[last]))
     usual = poses[int(np.searchsorted(gaps[: last + 1], at_usual))]
     moving = points(usual, 0) @ turn
-    tips = [side[side[:, 2] >= tip - _JAW] for side in (moving, fixed)]
+    tips = [_within(side, tip - _JAW, np.inf) for side in (moving, fixed)]
     low, high = np.max([pad.min(0) for pad in tips], axis=0), np.min([pad.max(0) for pad in tips], axis=0)
     depth = np.arange(_JAW, tip - float(closed.xanchor[j] @ z), 0.005)
     free = [_one_gap(robot, usual, turn, tip - h - 0.0025, tip - h + 0.0025) > _DEEP * at_usual for h in depth]

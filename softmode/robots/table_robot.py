@@ -62,7 +62,7 @@ _STUCK = 0.5e-3
 class _Search:
     """What a search may still do: its work is bounded, not its time, so that all machines find the same."""
 
-    left: int = _POSES
+    left: int = field(default_factory=lambda: _POSES)
     """Poses to be tried yet."""
 
 
