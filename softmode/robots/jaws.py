@@ -278,7 +278,8 @@ def _two_fingers(robot: RobotDescription, sides: tuple[list[int], list[int]]) ->
     face = np.array([left[:, 1].min(), right[:, 1].max()])
     opening = float(face[0] - face[1])
     if moved[0] @ y <= 0.0 or moved[1] @ y >= 0.0 or opening <= 0.0:
-        raise ConfigError(f"the fingers of {robot.name!r} do not close on each other", hint=_HINT)
+        gap = f"open, the hulls of what collides are {1e3 * opening:.0f} mm apart"
+        raise ConfigError(f"the fingers of {robot.name!r} do not close on each other: {gap}", hint=_HINT)
     pads = [left[left[:, 1] < face[0] + _FACE], right[right[:, 1] > face[1] - _FACE]]
     low = np.max([pad.min(0) for pad in pads], axis=0)
     high = np.min([pad.max(0) for pad in pads], axis=0)

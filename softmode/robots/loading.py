@@ -334,6 +334,10 @@ def _keep_robot(spec: Any, root: str | None, asset: RobotAsset) -> list[str]:
         raise ConfigError(
             f"robot file {asset.path} {what}", hint=f"pass root= one of {names}" if tops else "give it a <body>"
         )
+    for joint in spec.joints:
+        if joint.range[0] > joint.range[1]:
+            text = f"has its lower limit {joint.range[0]:g} above the upper one {joint.range[1]:g}"
+            raise AssetError(f"robot file {asset.path}: joint {joint.name!r} {text}", hint="exchange them")
     left = [body.name or "a body without a name" for body in tops if body is not chosen[0]]
     left += [f"{len(spec.worldbody.geoms)} shapes of the world"] if spec.worldbody.geoms else []
     notes = [f"left out beside the robot: {', '.join(left)}"] if left else []

@@ -269,7 +269,7 @@ def place_robot(
     if not 5 <= len(chain.joints) <= JOINT_MAX:
         raise ConfigError(
             f"robot {robot.name!r} has {len(chain.joints)} joints between base and tool, expected 5 to {JOINT_MAX}",
-            hint="write control.joint_target_q yourself, see RobotDescription.with_opening",
+            hint="hold a base that floats (floating=False), or write control.joint_target_q yourself (with_opening)",
         )
     loose = [robot.joint_names[j] for j in chain.joints if robot.drives[j] is None]
     if loose:

@@ -163,6 +163,15 @@ def test_what_is_left_out_is_said(tmp_path: Path) -> None:
     assert "empty range" in said and "effort 0" in said
 
 
+def test_limits_upside_down_are_refused(tmp_path: Path) -> None:
+    """MuJoCo takes them for none; a URDF with an attribute of another program is read."""
+    with pytest.raises(AssetError, match="lower limit 2 above the upper one -2"):
+        robots.load(write_arm5(tmp_path, ARM5.replace('range="-2 2"', 'range="2 -2"')))
+    urdf = write(tmp_path)
+    urdf.write_text(urdf.read_text().replace("<limit", '<limit drake:acceleration="2"'))
+    assert robots.load(urdf).gripper is not None
+
+
 def test_low_arms_stand_on_a_pedestal(tmp_path: Path) -> None:
     """An arm whose shoulder cannot bend down is placed higher, above a box that is only seen."""
     robot = robots.load(write_arm5(tmp_path))
