@@ -188,7 +188,7 @@ class ScriptedGrasp(ScriptedPolicy):
         return found[self._attempts % len(found)]
 
     def _held(self, grasp: Grasp) -> Grasp | None:
-        """Return a grasp that the arm reaches from above, turned by half a turn where it must be; None if it does not."""
+        """Return a grasp that the arm reaches from above, with half a turn where it must; None if it does not."""
         if not isinstance(self.arm, TableRobot):
             return grasp
         place = np.array(grasp.position)

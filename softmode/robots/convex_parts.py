@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -64,7 +65,7 @@ def _slabs(model: Any, mesh: int) -> list[Array]:
     k = int(np.ptp(points, axis=0).argmax())
     ends = np.linspace(points[:, k].min(), points[:, k].max(), _SLABS + 1)
     found, volume = [], 0.0
-    for low, high in zip(ends[:-1], ends[1:], strict=True):
+    for low, high in itertools.pairwise(ends):
         part = [points[(points[:, k] >= low) & (points[:, k] <= high)]]
         for plane in (low, high):
             crossing = (a[:, k] - plane) * (b[:, k] - plane) < 0.0

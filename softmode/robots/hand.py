@@ -70,7 +70,7 @@ def find_end_effector(robot: Compiled, drives: Sequence[JointDrive | None]) -> t
     """Return the name of a site or link that carries the tool, and how it was found.
 
     Names, then patterns, each among the sites first; then the link in which two fingers that close on each other meet;
-    then the last link of the chain with the most joints. If that is the one jaw of a hand that moves: the link in front.
+    then the last link of the chain with the most joints. If that is the jaw of a hand that moves: what is before it.
     """
     name, how = _found(robot, drives)
     links = {robot.link(b): b for b in range(1, robot.model.nbody)}

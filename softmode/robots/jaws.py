@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -102,7 +101,6 @@ class ParallelJaw:
             friction=gripper.friction,
         )
 
-
     def frame_at(self, gap: float) -> ToolPose:
         """Return the frame's pose in that of the tool where the pads are so far apart [m]."""
         if not self.follow:
@@ -146,7 +144,7 @@ def dry_friction_of(robot: RobotDescription) -> float:
 
 
 def measured(robot: RobotDescription) -> tuple[RobotDescription, ParallelJaw]:
-    """Measure the jaw of a robot from a file; the gripper of one that turns alone gets the ends between which it grasps.
+    """Measure the jaw of a robot from a file; a gripper of one that turns alone gets the ends between which it grasps.
 
     Raises:
         ConfigError: If the robot has no two fingers that close on each other, nor one that closes on a fixed one.
@@ -186,15 +184,14 @@ def _one_gap(robot: RobotDescription, data: Any, turn: Array, low: float, high: 
 
 
 def _one_jaw(robot: RobotDescription, sides: tuple[list[int], list[int]]) -> tuple[RobotDescription, ParallelJaw]:
-    """Measure a jaw that closes on a fixed one: its gap is that at the tips, whose middle is half of it from the face."""
+    """Measure a jaw that closes on a fixed one: its gap is that at the tips, half of it from the fixed face."""
     model, gripper = robot.model, robot.gripper
     assert gripper is not None
     j = int(model.body_jntadr[sides[0][0]])
     openings = np.linspace(0.0, 1.0, 41)
     poses = [_kinematics(robot, model, s) for s in openings]
     closed, axis = poses[0], poses[0].xaxis[j]
-    link = model.body(robot.end_effector).id
-    mount = closed.xmat[link].reshape(3, 3)
+    mount = closed.xmat[model.body(robot.end_effector).id].reshape(3, 3)
 
     def points(data: Any, k: int) -> Array:
         return in_world(data, _edges(robot.mjcf, tuple(sides[k])))
@@ -213,12 +210,14 @@ def _one_jaw(robot: RobotDescription, sides: tuple[list[int], list[int]]) -> tup
     last = int(np.argmax(gaps))
     if gaps[last] < _LEAST_OPENING:
         raise ConfigError(
-            f"the jaw of {robot.name!r} opens {1e3 * max(gaps[last], 0.0):.0f} mm at its tip, between the hulls of what "
-            f"collides; tasks need {1e3 * _LEAST_OPENING:.0f} mm",
+            f"the jaw of {robot.name!r} opens {1e3 * max(gaps[last], 0.0):.0f} mm at its tip, between the hulls of "
+            f"what collides; tasks need {1e3 * _LEAST_OPENING:.0f} mm",
             hint="give its links collision shapes that leave the space between the jaws free, such as boxes",
         )
     first = int(np.flatnonzero(gaps[: last + 1] <= 0.0)[-1]) if gaps[0] < 0.0 else 0
-    zero = np.interp(0.0, gaps[first : first + 2], openings[first : first + 2]) if gaps[first] < 0.0 else openings[first]
+    zero = (
+        np.interp(0.0, gaps[first : first + 2], openings[first : first + 2]) if gaps[first] < 0.0 else openings[first]
+    )
     ends = np.array([gripper.closed, gripper.open])
     ends = ends[0] + np.outer([zero, openings[last]], ends[1] - ends[0])
     jaws = RobotGripper(joints=gripper.joints, closed=tuple(ends[0].tolist()), open=tuple(ends[1].tolist()))
@@ -230,9 +229,6 @@ def _one_jaw(robot: RobotDescription, sides: tuple[list[int], list[int]]) -> tup
     depth = np.arange(_JAW, tip - float(closed.xanchor[j] @ z), 0.005)
     free = [_one_gap(robot, usual, turn, tip - h - 0.0025, tip - h + 0.0025) > _DEEP * at_usual for h in depth]
     middle = np.array([0.5 * (low[0] + high[0]), tips[1][:, 1].max(), tip - 0.5 * _JAW])
-    tool = Rotation.from_matrix(mount) * Rotation.from_quat(robot.tool[3:])
-    origin = closed.xpos[link] + mount @ np.array(robot.tool[:3])
-    place = tool.inv().apply(turn @ middle - origin)
     width = max(float(np.ptp(pad[:, 0])) for pad in tips)
     beyond = max(moving[:, 2].max(), (points(closed, 0) @ turn)[:, 2].max(), fixed[:, 2].max()) - middle[2]
     jaw = ParallelJaw(
@@ -245,7 +241,7 @@ def _one_jaw(robot: RobotDescription, sides: tuple[list[int], list[int]]) -> tup
         reach=float(beyond - 0.5 * _JAW + (depth[free.index(False)] if False in free else depth[-1])),
         palm=(0.5 * width, 0.5 * float(gaps[last])),
         friction=float(model.geom_friction[[geom for side in sides for geom in colliding(model, side)], 0].mean()),
-        frame=(*place.tolist(), *(tool.inv() * Rotation.from_matrix(turn)).as_quat().tolist()),
+        frame=_in_tool(robot, closed, turn, middle),
         follow=0.5,
     )
     return replace(robot, gripper=jaws), jaw
@@ -290,9 +286,6 @@ def _two_fingers(robot: RobotDescription, sides: tuple[list[int], list[int]]) ->
     beside = whole[whole[:, 2] >= min(low[2], high[2]) - 1e-9]
     base = base @ turn
     middle = np.array([0.5 * (low[0] + high[0]), 0.5 * (face[0] + face[1]), 0.5 * (low[2] + high[2])])
-    tool = Rotation.from_matrix(mount) * Rotation.from_quat(robot.tool[3:])
-    origin = wide.xpos[model.body(robot.end_effector).id] + mount @ np.array(robot.tool[:3])
-    place = tool.inv().apply(turn @ middle - origin)
     faces = [geom for side in sides for geom in colliding(model, side)]
     pad_width, pad_length = (max(float(high[j] - low[j]), _FACE) for j in (0, 2))
     return ParallelJaw(
@@ -305,8 +298,18 @@ def _two_fingers(robot: RobotDescription, sides: tuple[list[int], list[int]]) ->
         reach=float(tips - base[:, 2].max()),
         palm=(max(0.5 * float(np.ptp(base[:, 0])), 0.01), max(0.5 * float(np.ptp(base[:, 1])), 0.01)),
         friction=float(model.geom_friction[faces, 0].mean()),
-        frame=(*place.tolist(), *(tool.inv() * Rotation.from_matrix(turn)).as_quat().tolist()),
+        frame=_in_tool(robot, wide, turn, middle),
     )
+
+
+def _in_tool(robot: RobotDescription, data: Any, turn: Array, middle: Array) -> ToolPose:
+    """Return the pose of a frame in that of the tool, by its axes in the world and its origin along them [m]."""
+    link = robot.model.body(robot.end_effector).id
+    mount = data.xmat[link].reshape(3, 3)
+    tool = Rotation.from_matrix(mount) * Rotation.from_quat(robot.tool[3:])
+    x, y, z = tool.inv().apply(turn @ middle - data.xpos[link] - mount @ np.array(robot.tool[:3]))
+    a, b, c, d = (tool.inv() * Rotation.from_matrix(turn)).as_quat()
+    return (float(x), float(y), float(z), float(a), float(b), float(c), float(d))
 
 
 def _pad_corners(model: Any, data: Any, side: list[int], out: Array) -> Array:

@@ -124,7 +124,10 @@ def load(
     jaws, palm = robot.gripper(gripper, drives, start, link)
     behind = sorted({*robot.behind(palm), *robot.behind(link)})
     changed = _let_touch(spec, robot, behind)
-    if jaws is not None and len({branch(robot.model, palm, robot.joint_names.index(name)) for name in jaws.joints}) == 1:
+    if (
+        jaws is not None
+        and len({branch(robot.model, palm, robot.joint_names.index(name)) for name in jaws.joints}) == 1
+    ):
         rigid = np.flatnonzero(robot.model.body_weldid == robot.model.body_weldid[palm]).tolist()
         changed += cut_meshes(spec, robot.model, colliding(robot.model, sorted({*behind, *rigid} - {0})))
     for equality in list(spec.equalities):

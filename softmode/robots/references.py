@@ -72,7 +72,7 @@ def _parse(path: Path, left: int) -> tuple[ElementTree.Element, int]:
         try:
             tree = ElementTree.fromstring(data)
         except ElementTree.ParseError as error:
-            if error.code != _UNBOUND or path.suffix.lower() != ".urdf":  # what is checked of an MJCF is not what is read
+            if error.code != _UNBOUND or path.suffix.lower() != ".urdf":  # MuJoCo reads an MJCF itself
                 raise
             # Attributes of other programs, such as drake:acceleration, whose prefix nothing declares.
             tree = ElementTree.fromstring(re.sub(rb"([\s</])(\w+):(\w[\w.-]*\s*[=\s/>])", rb"\1\2.\3", data))

@@ -168,7 +168,7 @@ class TableRobot:
         return q[0]
 
     def turn_at(self, positions: Array, yaw: float) -> float | None:
-        """Return a yaw, or the one half a turn away, with which the tool gets to points, (N, 3) [m]; None if neither."""
+        """Return a yaw, or the one half a turn away, with which the tool gets to points (N, 3) [m]; None if neither."""
         turns = (yaw, yaw - math.copysign(math.pi, yaw))
         return next((turn for turn in turns if (self._held(positions, turn)[1] <= _NEAR).all()), None)
 
@@ -411,8 +411,8 @@ def _placed(
     at_home, error = _reach(chain, places, over_home, np.zeros(1), chain.home, search, bent=True)
     reached = error <= _NEAR
     # Opposite corners are what most bases do not reach. Turned by half a turn, the fingers change sides.
-    corners, every, home = points[[1, 6]], points[1:], points[:1]
-    for some, turns in ((corners, (0.0,)), (every, (0.0,)), (home, (_YAW, _YAW - np.pi)), (home, (-_YAW, np.pi - _YAW))):
+    sides = [(points[:1], (turn, turn - math.copysign(math.pi, turn))) for turn in (_YAW, -_YAW)]
+    for some, turns in ((points[[1, 6]], (0.0,)), (points[1:], (0.0,)), *sides):
         left = np.flatnonzero(reached)
         reached[left] = False
         for turn in turns:

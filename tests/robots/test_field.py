@@ -19,7 +19,7 @@ from softmode.errors import AssetError, ConfigError
 from softmode.robots import ParallelJaw
 from softmode.robots.chain import serial_chain
 from softmode.robots.hand import colliding
-from tests.robots.files import write_arm5
+from tests.robots.files import ARM5, write_arm5
 
 INERTIA = '<inertial><mass value="0.3"/><inertia ixx="1e-3" iyy="1e-3" izz="1e-3" ixy="0" ixz="0" iyz="0"/></inertial>'
 BOX = '<geometry><box size="0.05 0.008 0.02"/></geometry>'
