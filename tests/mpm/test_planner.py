@@ -20,7 +20,7 @@ from tests.mpm.scenes import ball, torus
 
 
 def test_ball_becomes_a_torus() -> None:
-    """With an eighth of the paper's particles 100 frames take 80 % of the loss, half of it in the first 60, always falling."""
+    """With an eighth of the paper's particles 100 frames take 80 % of the loss, the first 60 half of it."""
     run = morph(ball(6.93, 1.0), torus(7.0, 3.2, 1.0), MorphOptions(frame_count=100), device="cpu")
     assert (np.diff(run.losses) < 0.0).all()
     assert 1.0 - run.losses[6] / run.losses[0] >= 0.5
