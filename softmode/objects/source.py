@@ -208,12 +208,7 @@ def _upright_splats(
     else:
         cropped, name = _cropped_splats(config, source)
         choice = choose_part(cropped, config.part)
-        splats, stray, given = choice.part, 0.002, cropped.count
-        capture = {"part_splats": splats.count, "ground_splats": choice.ground_count}
-        if choice.other is not None:
-            low, high = choice.other.bounds(quantile=0.002)
-            box = np.concatenate([low - 0.02 * (high - low), high + 0.02 * (high - low)])
-            capture |= {"other_splats": choice.other.count, "other_crop": " ".join(f"{x:.4g}" for x in box)}
+        splats, stray, given, capture = choice.part, 0.002, cropped.count, dict(choice.told)
     bounds = splats.bounds(quantile=stray)
     extent = float(np.ptp(bounds, axis=0).max())
     if not extent > 0.0:

@@ -1,0 +1,119 @@
+"""The object of made captures: what is taken of it, of its carrier, and whether the report says what is doubtful.
+
+Run with `python -m benchmarks.carriers [smooth rough bare room] [--seeds 4800 --count 40] [--fill]`. Shares are of the
+splats of each label, volumes are those of the fill over the truth, times are processor time of one core.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from softmode.deformables.quadrature.quadrature import quadrature_from_splats
+from softmode.errors import AssetError
+from softmode.objects.parts import choose_part
+from tests.carriers import CARRIER, OBJECT, SETS, Made
+
+SEEDS = {"smooth": (4800, 40), "rough": (4900, 10), "bare": (5000, 20), "room": (5100, 4)}
+"""First seed and number of captures of each set, chosen after the code was done."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What became of one capture."""
+
+    object_share: float
+    carrier_share: float
+    right: bool
+    """At least 97 % (rough: 95 %) of the object's splats and at most 1 % (3 %) of the carrier's; a bare thing uncut; a
+    room named."""
+    doubted: bool
+    """Whether a doubt was named."""
+    option: str
+    """The named option that is right, if the choice was not."""
+    seconds: float
+    told: dict[str, str | int | float]
+    volume: float = float("nan")
+    """Volume of the fill over the truth."""
+
+
+def judge(made: Made, kind: str, *, fill: bool = False) -> Verdict:
+    """Take the object of a capture and compare it with the labels."""
+    start = time.process_time()
+    choice = choose_part(made.splats, "thickest")
+    seconds = time.process_time() - start
+    least, most = (0.95, 0.03) if kind == "rough" else (0.97, 0.01)
+
+    def shares(taken: tuple[int, ...]) -> tuple[float, float]:
+        kept = np.isin(choice.number, taken)
+        return tuple(float(kept[made.label == k].mean()) if (made.label == k).any() else 0.0 for k in (OBJECT, CARRIER))  # type: ignore[return-value]
+
+    def good(taken: tuple[int, ...]) -> bool:
+        found = shares(taken)
+        return found[0] >= least and found[1] <= most
+
+    options = [part.strip() for part in str(choice.told.get("doubt_parts", "")).split(",") if part.strip()]
+    right = good(choice.taken) and (made.carried or "carrier" not in choice.told)
+    if kind == "room":
+        right = "scene_crop" in choice.told
+    volume = float("nan")
+    if fill:
+        part = choice.part
+        try:
+            found = quadrature_from_splats(part.means, part.scales, part.quats, part.opacities, resolution=96)
+            volume = found.volume / made.volume
+        except AssetError:
+            volume = 0.0
+    best = next((part for part in options if good(tuple(map(int, part.split())))), "")
+    return Verdict(*shares(choice.taken), right, bool(options), best, seconds, choice.told, volume)
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("sets", nargs="*", default=list(SETS))
+    parser.add_argument("--seeds", type=int, help="first seed")
+    parser.add_argument("--count", type=int, help="number of captures")
+    parser.add_argument("--fill", action="store_true", help="fill what is taken, for the volume")
+    options = parser.parse_args()
+    for kind in options.sets:
+        first, count = SEEDS[kind]
+        first, count = options.seeds or first, options.count or count
+        found = []
+        for seed in range(first, first + count):
+            made = SETS[kind](seed)
+            one = judge(made, kind, fill=options.fill)
+            found.append(one)
+            state = (
+                "ok"
+                if one.right
+                else f"named, --part {one.option}"
+                if one.option
+                else "doubted"
+                if one.doubted
+                else "SILENT"
+            )
+            print(
+                f"{kind:7}{seed:6d} {made.name:22}{made.splats.count:7d} object {one.object_share:.3f}"
+                f" carrier {one.carrier_share:.3f} score {one.told.get('carrier_score', 0.0):.2f} volume {one.volume:.3f}"
+                f" {one.seconds:.1f} s  {state}{' (a doubt)' if one.right and one.doubted else ''}",
+                flush=True,
+            )
+        seconds = (
+            1e5
+            * sum(one.seconds for one in found)
+            / max(1, sum(int(one.told.get("scene_splats", 0)) or 1 for one in found))
+        )
+        wrong = [one for one in found if not one.right]
+        print(
+            f"{kind}: {len(found) - len(wrong)} of {len(found)} right; of the others {sum(bool(o.option) for o in wrong)}"
+            f" named with the right option, {sum(not o.doubted for o in wrong)} silent; {seconds:.1f}",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()
