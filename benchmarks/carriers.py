@@ -7,6 +7,7 @@ splats of each label, volumes are those of the fill over the truth, times are pr
 from __future__ import annotations
 
 import argparse
+import re
 import time
 from dataclasses import dataclass
 
@@ -55,7 +56,7 @@ def judge(made: Made, kind: str, *, fill: bool = False) -> Verdict:
         found = shares(taken)
         return found[0] >= least and found[1] <= most
 
-    options = [part.strip() for part in str(choice.told.get("doubt_parts", "")).split(",") if part.strip()]
+    options = re.findall(r"--part ([0-9 ]+?) takes", str(choice.told.get("doubt_remedy", "")))
     right = good(choice.taken) and (made.carried or "carrier" not in choice.told)
     if kind == "room":
         right = "scene_crop" in choice.told

@@ -275,7 +275,7 @@ def skirted_car() -> list[Solid]:
 
 def basket() -> list[Solid]:
     """Return a block with an arched handle."""
-    return [box(0.76, 0.4, 0.42, at=(0, 0, 0.21)), ring(0.3, 0.03, at=(0, 0, 0.42), turn=(90, 0, 0))]
+    return [box(0.76, 0.4, 0.42, at=(0, 0, 0.21)), ring(0.32, 0.02, at=(0, 0, 0.42), turn=(90, 0, 0))]
 
 
 def house() -> list[Solid]:
@@ -439,18 +439,18 @@ def render(
         for other in prims:
             hidden |= other.holds(x + 0.1 * pitch * n) if other is not prim else False
         if open_below or ground:
-            hidden |= ((x[:, 2] < base + 0.3 * pitch) & (n[:, 2] < -0.9))
+            hidden |= (x[:, 2] < base + 0.3 * pitch) & (n[:, 2] < -0.9)
         if indoors:
             low, high = (
                 np.array([f(p.corners[:, k]) for p in prims for k in range(3)]).reshape(-1, 3) for f in (np.min, np.max)
             )
             low, high = low.min(axis=0) + 0.05, high.max(axis=0) - 0.05
             hidden |= (((x < low) & (n < -0.5)) | ((x > high) & (n > 0.5)))[:, :2].any(axis=1)
-            hidden |= ((x[:, 2] < low[2]) & (n[:, 2] < 0.5))
+            hidden |= (x[:, 2] < low[2]) & (n[:, 2] < 0.5)
         size = np.ones(len(x))
         if prim.flat:
             middle = rng.random(len(x)) < share
-            hidden |= (middle & (rng.random(len(x)) > few))
+            hidden |= middle & (rng.random(len(x)) > few)
             size[middle] = wide
         keep = ~hidden
         x, n, size = x[keep], n[keep], size[keep]

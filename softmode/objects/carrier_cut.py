@@ -169,26 +169,33 @@ class Pieces:
         def option(last: int) -> str:
             return " ".join(map(str, range(1, last + 1)))
 
+        heights = [float(cut.floor[:, 2].mean()) for cut in self.cuts]
+        scores = [boundary.score for boundary in self.boundaries]
         told: dict[str, str | int | float] = {}
+        doubts = {k: score for k, score in enumerate(scores, start=1) if k != self.top}
         if self.top < self.count:
-            chosen = self.boundaries[self.top - 1]
+            score = scores[self.top - 1]
             told |= {
-                "carrier": chosen.kind,
+                "carrier": self.boundaries[self.top - 1].kind,
                 "carrier_splats": int((self.number > self.top).sum()),
-                "carrier_height": float(self.cuts[self.top - 1].floor[:, 2].mean()),
-                "carrier_score": chosen.score,
+                "carrier_height": heights[self.top - 1],
+                "carrier_score": score,
                 "carrier_part": option(self.count),
             }
-        others = {k: found.score for k, found in enumerate(self.boundaries, start=1) if k != self.top}
-        if self.top < self.count and (told["carrier_score"] < SURE or max(others.values(), default=0.0) > LIKELY):
-            others[self.count] = 1.0 - float(told["carrier_score"])
-        elif self.top < self.count:
-            others = {}
-        ranked = sorted(others, key=lambda k: -others[k])
-        if ranked:
-            heights = [float(self.cuts[k - 1].floor[:, 2].mean()) for k in ranked if k < self.count]
-            told["doubt_parts"] = ", ".join(option(k) for k in ranked)
-            told["doubt_heights"] = " ".join(f"{height:.4g}" for height in heights)
+            if score > SURE and max(doubts.values(), default=0.0) < LIKELY:
+                return told
+            doubts[self.count] = 1.0 - score
+            told["doubt"] = f"whether it ends at z = {heights[self.top - 1]:.4g} is not sure (score {score:.2f})"
+        else:
+            k = max(doubts, key=lambda k: doubts[k])
+            told["doubt"] = f"it was kept whole, but may be carried by what is below z = {heights[k - 1]:.4g}"
+            told["doubt"] += f" (score {doubts[k]:.2f})"
+        parts = {
+            k: f"--part {option(k)} takes "
+            + ("all of it" if k == self.count else f"what is above {heights[k - 1]:.4g}")
+            for k in sorted(doubts, key=lambda k: -doubts[k])
+        }
+        told["doubt_remedy"] = "look at it (softmode splat show); " + ", ".join(parts.values())
         return told
 
 

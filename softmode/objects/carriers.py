@@ -321,7 +321,8 @@ class Sections:
         far = ndimage.distance_transform_edt(~above)
         margin: Any = ndimage.map_coordinates(far, _outline(corners, 240).T, order=1, mode="nearest")
         around = float((margin > max(2.5, 0.05 * np.sqrt(below.sum()))).mean())
-        radius = np.sqrt(_hull_of(above)[0] / np.pi)
+        area, outline = _hull_of(above)
+        radius = np.sqrt(area / np.pi)
         bulk, up = self.areas[k:], (self.heights[k:] - self.heights[k]) / self.cell
         rise = float(bulk @ up) / max(float(bulk.sum()), 1e-300)
         lean = bulk @ self.centres[k:] / bulk.sum() - np.argwhere(above).mean(axis=0)
@@ -329,25 +330,25 @@ class Sections:
         plain_above, fine, share = self.look(self.heights[k] + self.layer)
         contrast = max(ramp(plain - plain_above, 0.15, 0.4), ramp(coarse / fine, 1.8, 3.5))
         extent = max(float(np.ptp(np.argwhere(above), axis=0).max()) * self.cell, self.heights[-1] - self.heights[k])
-        low_edge = _edge_distance(_hull_of(above)[1], bulk @ self.centres[k:] / bulk.sum())
+        held, most = float(bulk.sum() / self.areas.sum()), extent / self.size
+        steady = _edge_distance(outline, bulk @ self.centres[k:] / bulk.sum()) / max(rise, 1e-9)
         lower, size = self.areas[: max(1, k - reach)], float(below.sum()) * self.cell**2
         prism, legs = float((lower > 0.8 * size).mean()), float((lower < 0.2 * size).mean())
         why = {
             "level": ramp(cover, 0.18, 0.42),
             "free": ramp(around + 0.3 * contrast, 0.7, 0.85),
             "convex": ramp(float(below.sum()) / max(hull, 1.0), 0.6, 0.8),
-            "stands": ramp(radius / max(rise, 1e-9), 0.2, 0.35),
+            "stands": ramp(radius / max(rise, 1e-9), 0.2, 0.35) * ramp(steady, 0.06, 0.12),
             "over": ramp(-float(np.linalg.norm(lean)) / max(radius, 1e-9), -1.6, -1.1),
             "plain": ramp(plain, 0.45, 0.6),
             "carrier": ramp(max(contrast, ramp(prism, 0.8, 0.95), ramp(legs, 0.5, 0.7)), 0.1, 0.5),
             "smaller": ramp(-float(above.sum() / below.sum()), -0.95, -0.85),
-            "enough": ramp(share, 0.02, 0.06) * ramp(extent / self.size, 0.15, 0.3),
+            "enough": ramp(share, 0.02, 0.06) * ramp(held, 0.01, 0.04) * ramp(most, 0.18, 0.35),
         }
         score = float(np.prod(list(why.values())))
-        why |= {"cover": cover, "steady": low_edge / max(rise, 1e-9), "bulk": float(self.areas[k:].sum() / self.areas.sum()), "convexity": float(below.sum()) / max(hull, 1.0), "plain above": plain_above}
-        return [
-            Boundary(kind="top", height=float(self.heights[k]), score=score, contact=above, reach=reach, why=why),
-        ]
+        why |= {"convexity": float(below.sum()) / max(hull, 1.0), "plain above": plain_above}
+        top = Boundary(kind="top", height=float(self.heights[k]), score=score, contact=above, reach=reach, why=why)
+        return [top]
 
     def stem(self) -> list[Boundary]:
         """Return the end of a thin prism in one piece under something much wider, if there is one."""

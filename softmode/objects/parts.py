@@ -97,12 +97,11 @@ def choose_part(splats: Splats, rule: Part) -> Choice:
         floors = [] if pieces is None else pieces.floors(set(taken), things[chosen])
         part = joined([splats.subset(np.isin(number, taken)), *floors], splats.name)
     told: dict[str, str | int | float] = {"part_splats": int(np.isin(number, taken).sum())}
+    told["floor_splats"] = max(part.count - int(told["part_splats"]), 0)
     told["ground_splats"] = 0 if ground is None else int(ground.splats.sum())
     other = next((things[k] for k in others if things[k].count >= SURROUNDED * things[chosen].count), None)
     if other is not None:
-        low, high = other.bounds(quantile=0.002)
-        box = np.concatenate([low - 0.02 * (high - low), high + 0.02 * (high - low)])
-        told |= {"other_splats": other.count, "other_crop": " ".join(f"{x:.4g}" for x in box)}
+        told |= {"other_splats": other.count, "other_crop": _crop_of(other), "other_part": count + 1}
     if pieces is not None and rule == "thickest":
         told |= pieces.told
     return Choice(part=part, number=number, taken=taken, told=told)
@@ -117,6 +116,12 @@ def _linked(scene: Splats) -> tuple[float, NDArray[np.intp]]:
     pitch = 1.5 * np.median(KDTree(scene.means).query(few, k=min(7, scene.count))[0][:, -1])
     gap = max(0.015 * float(np.linalg.norm(high - low)), float(pitch), 1.0e-9)
     return gap, label_components(scene, gap=gap, faces=True)
+
+
+def _crop_of(part: Splats) -> str:
+    """Return the box around a part, as an option takes it."""
+    low, high = part.bounds(quantile=0.002)
+    return " ".join(f"{x:.4g}" for x in (*(low - 0.02 * (high - low)), *(high + 0.02 * (high - low))))
 
 
 def _surrounds(part: Splats, inner: Splats) -> bool:

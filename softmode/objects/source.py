@@ -173,7 +173,7 @@ def _splat_source(config: ObjectConfig, given: str | Path | Splats | None) -> Ob
     splats, told, capture, name = _upright_splats(config, given)
     arrays = (splats.means, splats.scales, splats.quats, splats.opacities)
     solid = partial(quadrature_from_splats, *arrays, surface_count=config.surface_count, resolution=config.resolution)
-    key = ("splats", *arrays, config.resolution)
+    key = ("splats, shown", *arrays, config.resolution)
     count = int(capture["asset_splats"])
     return ObjectSource(splats, solid, name, key, count, config.longest_edge, None, capture, told.offset, told.notes)
 
