@@ -323,30 +323,37 @@ class Sections:
         around = float((margin > max(2.5, 0.05 * np.sqrt(below.sum()))).mean())
         area, outline = _hull_of(above)
         radius = np.sqrt(area / np.pi)
-        bulk, up = self.areas[k:], (self.heights[k:] - self.heights[k]) / self.cell
-        rise = float(bulk @ up) / max(float(bulk.sum()), 1e-300)
-        lean = bulk @ self.centres[k:] / bulk.sum() - np.argwhere(above).mean(axis=0)
+        bulk = np.where(np.arange(len(self.areas)) > k + reach, self.areas, 0.0)
+        centre = bulk @ self.centres / max(float(bulk.sum()), 1e-300)
+        rise = max(float(bulk @ (self.heights - self.heights[k])) / max(float(bulk.sum()), 1e-300) / self.cell, 1e-9)
+        lean = float(np.linalg.norm(centre - np.argwhere(above).mean(axis=0)))
         plain, coarse, _ = self.look(-np.inf, self.heights[k] - self.layer)
         plain_above, fine, share = self.look(self.heights[k] + self.layer)
         contrast = max(ramp(plain - plain_above, 0.15, 0.4), ramp(coarse / fine, 1.8, 3.5))
         extent = max(float(np.ptp(np.argwhere(above), axis=0).max()) * self.cell, self.heights[-1] - self.heights[k])
         held, most = float(bulk.sum() / self.areas.sum()), extent / self.size
-        steady = _edge_distance(outline, bulk @ self.centres[k:] / bulk.sum()) / max(rise, 1e-9)
+        steady = _edge_distance(outline, centre) / rise
         lower, size = self.areas[: max(1, k - reach)], float(below.sum()) * self.cell**2
         prism, legs = float((lower > 0.8 * size).mean()), float((lower < 0.2 * size).mean())
         why = {
             "level": ramp(cover, 0.18, 0.42),
             "free": ramp(around + 0.3 * contrast, 0.7, 0.85),
             "convex": ramp(float(below.sum()) / max(hull, 1.0), 0.6, 0.8),
-            "stands": ramp(radius / max(rise, 1e-9), 0.2, 0.35) * ramp(steady, 0.06, 0.12),
-            "over": ramp(-float(np.linalg.norm(lean)) / max(radius, 1e-9), -1.6, -1.1),
+            "stands": ramp(radius / rise, 0.17, 0.3) * ramp(steady, 0.06, 0.12),
+            "over": ramp(-lean / max(radius, 1e-9), -1.6, -1.1),
             "plain": ramp(plain, 0.45, 0.6),
             "carrier": ramp(max(contrast, ramp(prism, 0.8, 0.95), ramp(legs, 0.5, 0.7)), 0.1, 0.5),
             "smaller": ramp(-float(above.sum() / below.sum()), -0.95, -0.85),
             "enough": ramp(share, 0.02, 0.06) * ramp(held, 0.01, 0.04) * ramp(most, 0.18, 0.35),
         }
         score = float(np.prod(list(why.values())))
-        why |= {"convexity": float(below.sum()) / max(hull, 1.0), "plain above": plain_above}
+        why |= {
+            "steady": steady,
+            "held": held,
+            "most": most,
+            "convexity": float(below.sum()) / max(hull, 1.0),
+            "plain above": plain_above,
+        }
         top = Boundary(kind="top", height=float(self.heights[k]), score=score, contact=above, reach=reach, why=why)
         return [top]
 
