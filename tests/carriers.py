@@ -428,6 +428,7 @@ def render(
     """
     base = min(prim.corners[:, 2].min() for prim in prims)
     pitch = float(np.sqrt(sum(prim.mesh.area for prim in prims) / (1.4 * count)))
+    carries = any(prim.label == CARRIER for prim in prims)
     few, share = (0.08, 0.75) if wide < 5.0 else (0.012, 0.95)
     rows: list[tuple[Array, Array, Array, int]] = []
     for prim in prims:
@@ -447,6 +448,8 @@ def render(
             low, high = low.min(axis=0) + 0.05, high.max(axis=0) - 0.05
             hidden |= (((x < low) & (n < -0.5)) | ((x > high) & (n > 0.5)))[:, :2].any(axis=1)
             hidden |= (x[:, 2] < low[2]) & (n[:, 2] < 0.5)
+        # What would reach through a thin carrier is not there.
+        hidden |= carries & (prim.label == OBJECT) & (x[:, 2] < -0.03)
         size = np.ones(len(x))
         if prim.flat:
             middle = rng.random(len(x)) < share
@@ -494,6 +497,7 @@ def render(
     within = np.any([prim.holds(trial) for prim in prims if prim.label == OBJECT], axis=0)
     for prim in prims:
         within &= (prim.label == OBJECT) | ~prim.holds(trial)
+    within &= ~carries | (trial[:, 2] > -0.03)
     volume = float(within.mean() * np.ptp(x[label == OBJECT], axis=0).prod())
     lean = Rotation.from_rotvec(np.radians(tilt) * np.array([np.cos(1.0 + count), np.sin(1.0 + count), 0.0]))
     tint = np.where(label[:, None] == OBJECT, (0.75, 0.5, 0.35) + 0.15 * np.sin(9.0 * x + 4.0 * x[:, [1, 2, 0]]), 0.6)
@@ -505,7 +509,6 @@ def render(
         sh=((np.clip(tint + rng.normal(0.0, 0.03, x.shape), 0.0, 1.0) - 0.5) / SH_DC)[:, None],
         name=name,
     )
-    carries = any(prim.label == CARRIER for prim in prims)
     return Made(name=name, splats=splats, label=label, volume=volume, carried=carries)
 
 

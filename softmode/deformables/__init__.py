@@ -42,7 +42,8 @@ if TYPE_CHECKING:
     from softmode.deformables.reduction.patch import Patch
     from softmode.deformables.reduction.reduced_stiffness import elastic_modes
     from softmode.deformables.reduction.report import BodyReport, report_body
-    from softmode.deformables.skinning.skin_splats import SkinSplats, average_basis
+    from softmode.deformables.skinning.averages import average_basis
+    from softmode.deformables.skinning.skin_splats import SkinSplats
     from softmode.deformables.skinning.skinning_adjoint import AdjointSkinning
     from softmode.deformables.solver.attachments import Attachment, attach
     from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions

@@ -10,7 +10,8 @@ import pytest
 import warp as wp
 from scipy.linalg import polar
 
-from softmode.deformables.skinning.skin_splats import STRETCH_LIMIT, SkinSplats, average_basis
+from softmode.deformables.skinning.averages import average_basis
+from softmode.deformables.skinning.skin_splats import STRETCH_LIMIT, SkinSplats
 from softmode.deformables.skinning.skinning_kernels import vec6
 from softmode.errors import BasisError
 from softmode.splats.splats import rotations_from_quats
