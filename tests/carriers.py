@@ -497,7 +497,7 @@ def render(
     within = np.any([prim.holds(trial) for prim in prims if prim.label == OBJECT], axis=0)
     for prim in prims:
         within &= (prim.label == OBJECT) | ~prim.holds(trial)
-    within &= ~carries | (trial[:, 2] > -0.03)
+    within &= (not carries) | (trial[:, 2] > -0.03)
     volume = float(within.mean() * np.ptp(x[label == OBJECT], axis=0).prod())
     lean = Rotation.from_rotvec(np.radians(tilt) * np.array([np.cos(1.0 + count), np.sin(1.0 + count), 0.0]))
     tint = np.where(label[:, None] == OBJECT, (0.75, 0.5, 0.35) + 0.15 * np.sin(9.0 * x + 4.0 * x[:, [1, 2, 0]]), 0.6)

@@ -333,16 +333,18 @@ class Sections:
         extent = max(float(np.ptp(np.argwhere(above), axis=0).max()) * self.cell, self.heights[-1] - self.heights[k])
         held, most = float(bulk.sum() / self.areas.sum()), extent / self.size
         steady = _edge_distance(outline, centre) / rise
-        lower, size = self.areas[: max(1, k - reach)], float(below.sum()) * self.cell**2
-        prism, legs = float((lower > 0.8 * size).mean()), float((lower < 0.2 * size).mean())
+        # The discs of its top may stand out beyond its edges: a prism is as wide as its upper half is on the whole.
+        lower = self.areas[: max(1, k - reach)]
+        prism = float((lower > 0.8 * np.median(lower[len(lower) // 2 :])).mean())
+        legs = float((lower < 0.2 * below.sum() * self.cell**2).mean())
         why = {
             "level": ramp(cover, 0.18, 0.42),
             "free": ramp(around + 0.3 * contrast, 0.7, 0.85),
             "convex": ramp(float(below.sum()) / max(hull, 1.0), 0.6, 0.8),
-            "stands": ramp(radius / rise, 0.17, 0.3) * ramp(steady, 0.06, 0.12),
+            "stands": ramp(radius / rise, 0.17, 0.3) * ramp(steady, 0.03, 0.08),
             "over": ramp(-lean / max(radius, 1e-9), -1.6, -1.1),
             "plain": ramp(plain, 0.45, 0.6),
-            "carrier": ramp(max(contrast, ramp(prism, 0.8, 0.95), ramp(legs, 0.5, 0.7)), 0.1, 0.5),
+            "carrier": ramp(max(contrast, ramp(prism, 0.6, 0.85), ramp(legs, 0.5, 0.7)), 0.1, 0.5),
             "smaller": ramp(-float(above.sum() / below.sum()), -0.95, -0.85),
             "enough": ramp(share, 0.02, 0.06) * ramp(held, 0.01, 0.04) * ramp(most, 0.18, 0.35),
         }
