@@ -12,6 +12,7 @@ from scipy.spatial import KDTree
 
 from softmode.errors import ConfigError
 from softmode.objects.carrier_cut import divide
+from softmode.objects.rooms import crop_of, scene_crop
 from softmode.splats.components import label_components
 from softmode.splats.splats import Splats, joined, rotations_from_quats
 
@@ -70,12 +71,13 @@ def choose_part(splats: Splats, rule: Part) -> Choice:
     gap, label = _linked(splats.subset(scene) if ground is not None else splats)
     parts = [scene[label == k] for k in range(int(label.max(initial=-1)) + 1)] or [np.arange(splats.count)]
     things, order = [splats.subset(rows) for rows in parts], list(range(len(parts)))
+    first = None
     if rule == "largest":
         chosen = 0
     elif rule == "tallest":
         chosen = max(order, key=lambda k: float(np.ptp(things[k].bounds(quantile=0.005)[:, 2])))
     else:
-        chosen = max(order, key=lambda k: _thickness(things[k]))
+        chosen = first = max(order, key=lambda k: _thickness(things[k]))
         while ground is not None and (inner := [k for k in order if _surrounds(things[chosen], things[k])]):
             chosen = max(inner, key=lambda k: _thickness(things[k]))
     number, others = np.zeros(splats.count, dtype=np.intp), [k for k in order if k != chosen]
@@ -101,9 +103,13 @@ def choose_part(splats: Splats, rule: Part) -> Choice:
     told["ground_splats"] = 0 if ground is None else int(ground.splats.sum())
     other = next((things[k] for k in others if things[k].count >= SURROUNDED * things[chosen].count), None)
     if other is not None:
-        told |= {"other_splats": other.count, "other_crop": _crop_of(other), "other_part": count + 1}
-    if pieces is not None and rule == "thickest":
-        told |= pieces.told
+        told |= {"other_splats": other.count, "other_crop": crop_of(other), "other_part": count + 1}
+    if rule == "thickest":
+        told |= {} if pieces is None else pieces.told
+        if crop := scene_crop(
+            things[chosen], [things[k] for k in others], within=first not in (None, chosen), grounded=ground is not None
+        ):
+            told["scene_crop"] = crop
     return Choice(part=part, number=number, taken=taken, told=told)
 
 
@@ -116,12 +122,6 @@ def _linked(scene: Splats) -> tuple[float, NDArray[np.intp]]:
     pitch = 1.5 * np.median(KDTree(scene.means).query(few, k=min(7, scene.count))[0][:, -1])
     gap = max(0.015 * float(np.linalg.norm(high - low)), float(pitch), 1.0e-9)
     return gap, label_components(scene, gap=gap, faces=True)
-
-
-def _crop_of(part: Splats) -> str:
-    """Return the box around a part, as an option takes it."""
-    low, high = part.bounds(quantile=0.002)
-    return " ".join(f"{x:.4g}" for x in (*(low - 0.02 * (high - low)), *(high + 0.02 * (high - low))))
 
 
 def _surrounds(part: Splats, inner: Splats) -> bool:

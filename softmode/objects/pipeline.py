@@ -166,8 +166,8 @@ def build_standing(
 def dressed(body: ReducedBody, config: ObjectConfig, source: ObjectSource, material: Material | None) -> SoftObject:
     """Return a body with the splats and the field of its source in its frame; its provenance tells the asset.
 
-    Splats of a capture without solid under them are left out, as is what lies beyond an eighth of the body's size around
-    its bounding box.
+    Splats of a capture without solid under them are left out, as is what lies beyond an eighth of the body's size
+    around its bounding box.
     """
     turn = np.array(json.loads(str(body.provenance["turn"])))
     splats = _laid_down(source.splats, turn)

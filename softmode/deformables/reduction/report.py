@@ -566,7 +566,7 @@ def _check_asset(body: ReducedBody, told: dict[str, float], notes: _Notes) -> No
     if doubt := body.provenance.get("quadrature_doubt"):
         notes.find("warning", "carrier", str(doubt), str(body.provenance["quadrature_doubt_remedy"]))
     if crop := body.provenance.get("quadrature_scene_crop"):
-        what = "the capture is a scene of several things or a room, and no object stands alone in it"
+        what = "the capture is a room, or a scene of several things: one part of it was taken"
         notes.find("warning", "scene", what, f"take one thing of it, to begin with --crop {crop}, or choose --part")
     _check_fill(told, notes)
     if told.get("quadrature_inside_out"):
