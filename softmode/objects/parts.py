@@ -35,6 +35,8 @@ class Choice:
 
     part: Splats
     """The object, closed by a floor where it was cut off what carries it."""
+    rows: NDArray[np.intp]
+    """Its splats in the capture, in its order; what closes it comes after them."""
     number: NDArray[np.intp]
     """Number of the candidate that each splat of the capture belongs to, from 1 on, shape (N,); 0 for the ground and
     floaters. The first is the topmost piece of the object's part, the next carry it, others are parts of their own."""
@@ -65,7 +67,8 @@ def choose_part(splats: Splats, rule: Part) -> Choice:
         ConfigError: If there is no candidate of a number.
     """
     if rule == "all":
-        return Choice(part=splats, number=np.ones(splats.count, dtype=np.intp), taken=(1,), told={})
+        every = np.arange(splats.count)
+        return Choice(part=splats, rows=every, number=np.ones_like(every), taken=(1,), told={})
     ground = None if rule == "largest" else find_ground(splats)
     scene = np.arange(splats.count) if ground is None else np.flatnonzero(~ground.splats)
     gap, label = _linked(splats.subset(scene) if ground is not None else splats)
@@ -94,12 +97,12 @@ def choose_part(splats: Splats, rule: Part) -> Choice:
             f"part {' '.join(map(str, sorted(missing)))}: the capture has the candidates 1 to {number.max()}",
             hint="`softmode splat show FILE` draws them with their numbers",
         )
-    part = things[chosen]
+    part, rows = things[chosen], parts[chosen]
     if set(taken) != set(range(1, count + 1)):
         floors = [] if pieces is None else pieces.floors(set(taken), things[chosen])
-        part = joined([splats.subset(np.isin(number, taken)), *floors], splats.name)
-    told: dict[str, str | int | float] = {"part_splats": int(np.isin(number, taken).sum())}
-    told["floor_splats"] = max(part.count - int(told["part_splats"]), 0)
+        rows = np.flatnonzero(np.isin(number, taken))
+        part = joined([splats.subset(rows), *floors], splats.name)
+    told: dict[str, str | int | float] = {"part_splats": len(rows), "floor_splats": part.count - len(rows)}
     told["ground_splats"] = 0 if ground is None else int(ground.splats.sum())
     other = next((things[k] for k in others if things[k].count >= SURROUNDED * things[chosen].count), None)
     if other is not None:
@@ -110,7 +113,7 @@ def choose_part(splats: Splats, rule: Part) -> Choice:
             things[chosen], [things[k] for k in others], within=first not in (None, chosen), grounded=ground is not None
         ):
             told["scene_crop"] = crop
-    return Choice(part=part, number=number, taken=taken, told=told)
+    return Choice(part=part, rows=rows, number=number, taken=taken, told=told)
 
 
 def _linked(scene: Splats) -> tuple[float, NDArray[np.intp]]:

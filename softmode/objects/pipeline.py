@@ -31,6 +31,7 @@ from softmode.objects.shapes.primitives import scaled, turned
 from softmode.objects.soft_object import SoftObject
 from softmode.objects.source import ObjectSource
 from softmode.splats.splats import Splats
+from softmode.stages import stage
 
 Array = NDArray[np.float64]
 
@@ -73,7 +74,8 @@ def standing_quadrature(config: ObjectConfig, source: ObjectSource) -> tuple[Qua
         AssetError: If it encloses no volume.
     """
     try:
-        quadrature = source.integrate()
+        with stage(f"integrating {source.name}"):
+            quadrature = source.integrate()
         turns = _may_turn(config) and config.surface_count != SURFACE_COUNT
         like = source.integrate(surface_count=SURFACE_COUNT) if turns else quadrature
     except AssetError as error:

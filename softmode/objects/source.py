@@ -41,6 +41,7 @@ from softmode.splats.formats import read_splats
 from softmode.splats.formats.common import offset_note
 from softmode.splats.point_cloud import is_point_cloud, read_points
 from softmode.splats.splats import Splats, up_rotation
+from softmode.stages import stage
 
 DEFAULT_COLORS: tuple[Color, Color] = ((0.93, 0.55, 0.22), (0.97, 0.90, 0.76))
 """Colours of a shape that is given none."""
@@ -207,7 +208,8 @@ def _upright_splats(
         name, stray, given = "plush", 0.0, splats.count
     else:
         cropped, name = _cropped_splats(config, source)
-        choice = choose_part(cropped, config.part)
+        with stage("finding the object in the capture"):
+            choice = choose_part(cropped, config.part)
         splats, stray, given, capture = choice.part, 0.002, cropped.count, dict(choice.told)
     bounds = splats.bounds(quantile=stray)
     extent = float(np.ptp(bounds, axis=0).max())
