@@ -40,6 +40,17 @@ class Verdict:
     volume: float = float("nan")
     """Volume of the fill over the truth."""
 
+    @property
+    def line(self) -> str:
+        """What the table says of it."""
+        state = "ok" if self.right else f"named, --part {self.option}" if self.option else "doubted"
+        state = state if self.right or self.doubted else "SILENT"
+        return (
+            f"object {self.object_share:.3f} carrier {self.carrier_share:.3f}"
+            f" score {self.told.get('carrier_score', 0.0):.2f} volume {self.volume:.3f} {self.seconds:.1f} s"
+            f"  {state}{' (a doubt)' if self.right and self.doubted else ''}"
+        )
+
 
 def judge(made: Made, kind: str, *, fill: bool = False) -> Verdict:
     """Take the object of a capture and compare it with the labels."""
@@ -83,37 +94,19 @@ def main() -> None:
     for kind in options.sets:
         first, count = SEEDS[kind]
         first, count = options.seeds or first, options.count or count
-        found = []
+        found, splats = [], 0
         for seed in range(first, first + count):
             made = SETS[kind](seed)
-            one = judge(made, kind, fill=options.fill)
-            found.append(one)
-            state = (
-                "ok"
-                if one.right
-                else f"named, --part {one.option}"
-                if one.option
-                else "doubted"
-                if one.doubted
-                else "SILENT"
-            )
-            print(
-                f"{kind:7}{seed:6d} {made.name:22}{made.splats.count:7d} object {one.object_share:.3f}"
-                f" carrier {one.carrier_share:.3f} score {one.told.get('carrier_score', 0.0):.2f} volume {one.volume:.3f}"
-                f" {one.seconds:.1f} s  {state}{' (a doubt)' if one.right and one.doubted else ''}",
-                flush=True,
-            )
-        seconds = (
-            1e5
-            * sum(one.seconds for one in found)
-            / max(1, sum(int(one.told.get("scene_splats", 0)) or 1 for one in found))
-        )
+            found.append(judge(made, kind, fill=options.fill))
+            splats += made.splats.count
+            print(f"{kind:7}{seed:6d} {made.name:22}{made.splats.count:7d} {found[-1].line}", flush=True)
         wrong = [one for one in found if not one.right]
+        seconds = 1e5 * sum(one.seconds for one in found) / splats
         print(
-            f"{kind}: {len(found) - len(wrong)} of {len(found)} right; of the others {sum(bool(o.option) for o in wrong)}"
-            f" named with the right option, {sum(not o.doubted for o in wrong)} silent; {seconds:.1f}",
-            flush=True,
+            f"{kind}: {count - len(wrong)} of {count} right, {seconds:.2f} s for 100,000 splats; of the others", end=" "
         )
+        print(f"{sum(bool(one.option) for one in wrong)} named with the right option,", end=" ")
+        print(f"{sum(not one.doubted for one in wrong)} silent", flush=True)
 
 
 if __name__ == "__main__":

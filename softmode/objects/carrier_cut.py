@@ -184,8 +184,10 @@ class Pieces:
             }
             if score > SURE and max(doubts.values(), default=0.0) < LIKELY:
                 return told
+            others = ", ".join(f"z = {heights[k - 1]:.4g} (score {found:.2f})" for k, found in doubts.items())
+            told["doubt"] = f"it was cut off what carries it at z = {heights[self.top - 1]:.4g} (score {score:.2f})"
+            told["doubt"] += f"; it may end elsewhere: {others}" if others else ", which is not sure"
             doubts[self.count] = 1.0 - score
-            told["doubt"] = f"whether it ends at z = {heights[self.top - 1]:.4g} is not sure (score {score:.2f})"
         else:
             k = max(doubts, key=lambda k: doubts[k])
             told["doubt"] = f"it was kept whole, but may be carried by what is below z = {heights[k - 1]:.4g}"
