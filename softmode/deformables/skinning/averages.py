@@ -75,7 +75,7 @@ def average_basis(
     small = arms[:, 2] <= functions.narrow
     arms = np.maximum(arms, least)
     tell = progress or (lambda share: None)
-    grid = _Grid(functions, x, arms, axes, small, tell) if len(x) >= MANY else None
+    grid = _Grid(functions, x, arms, axes, small, tell) if len(x) >= MANY and functions.narrow > 0.0 else None
     exact = np.ones(len(x), dtype=bool) if grid is None else grid.exact
     parts: list[tuple[NDArray[np.intp], Array, Array]] = []
     groups = [(kind, here) for kind in (small, ~small) for here in ((kind & exact), (kind & ~exact))]
