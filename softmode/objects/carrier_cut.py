@@ -81,7 +81,7 @@ def cut_at(sections: Sections, boundary: Boundary, gap: float) -> Cut:
     kept = np.flatnonzero(above)
     if len(kept) > 50:
         wide = kept[np.linalg.norm(surface.tangents[kept, :, 1], axis=1) > 0.4 * gap]
-        linked = np.concatenate([x[kept], disc_points(x[wide], surface.tangents[wide])])
+        linked = np.concatenate([x[kept], disc_points(x[wide], surface.tangents[wide], 0.8 * gap)])
         label = link_labels(linked, 0.8 * gap)[: len(kept)]
         bulk = np.bincount(label, surface.areas[kept])
         above[kept] = (bulk >= 0.02 * bulk.max())[label]

@@ -203,6 +203,8 @@ def find_ground(splats: Splats) -> Ground | None:
 def _fullest(height: NDArray[np.float64], flat: NDArray[np.bool_], area: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return which of flat splats lie around the fullest peak of heights; all of them if there is no other one."""
     some = np.flatnonzero(flat)
+    if not np.ptp(height[some]) > 0.0:
+        return flat
     bins = int(np.clip(len(some) // 50, 2, 60))
     count, edge = np.histogram(height[some], bins=bins, weights=area[some])
     smooth = ndimage.gaussian_filter1d(count, 1.5)

@@ -61,7 +61,8 @@ def _inside_of_walls(part: Splats) -> Splats | None:
     upright = np.abs(rotations_from_quats(solid.quats)[np.arange(len(x)), 2, thin]) < 0.3
     low, high = np.quantile(x, [0.01, 0.99], axis=0)
     plan = x[:, :2][((x > low) & (x < high))[:, :2].all(axis=1)]
-    if len(plan) < 100 or not (np.ptp(plan, axis=0) > 0.0).all() or np.ptp(plan, axis=0).max() < high[2] - low[2]:
+    x_edge, y_edge, z_edge = high - low
+    if len(plan) < 100 or not min(x_edge, y_edge) > 0.0 or not 0.0 < z_edge < max(x_edge, y_edge):
         return None
     hull = ConvexHull(plan)
     depth = -(x[:, :2] @ hull.equations[:, :2].T + hull.equations[:, 2]).max(axis=1)

@@ -94,18 +94,25 @@ def _chains(points: NDArray[Any], gap: float) -> tuple[KDTree, NDArray[np.intp]]
 
 
 def _disc_points(splats: Splats, solid: NDArray[np.intp], gap: float) -> NDArray[np.float32]:
-    """Return points on the discs of flat splats that are wider than half the gap, half their width apart."""
+    """Return points on the discs of flat splats that are wider than half the gap."""
     low, high = splats.bounds(quantile=0.01)
     scales = np.sort(splats.scales, axis=1)
     flat = (scales[:, 1] > 0.5 * gap) & (scales[:, 0] < 0.3 * scales[:, 1]) & (splats.opacities >= 0.5)
     some = solid[(flat & (scales[:, 2] < 0.25 * np.linalg.norm(high - low)))[solid]]
     order = np.argsort(-splats.scales[some], axis=1)[:, None, :2]
     axes = np.take_along_axis(rotations_from_quats(splats.quats[some]), order, axis=2)
-    return disc_points(splats.means[some], axes * np.take_along_axis(splats.scales[some], order[:, 0], axis=1)[:, None])
+    tangents = axes * np.take_along_axis(splats.scales[some], order[:, 0], axis=1)[:, None]
+    return disc_points(splats.means[some], tangents, gap)
 
 
-def disc_points(means: NDArray[Any], tangents: NDArray[Any]) -> NDArray[np.float32]:
-    """Return points on discs of one and a half tangents (N, 3, 2) around centres (N, 3), shape (36 N, 3)."""
-    ring = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
-    disc = np.concatenate([r * np.stack([np.cos(ring), np.sin(ring)]) for r in (0.5, 1.0, 1.5)], axis=1)
-    return (means[:, None] + np.einsum("nij,jk->nki", tangents, disc)).reshape(-1, 3).astype(np.float32)
+def disc_points(means: NDArray[Any], tangents: NDArray[Any], gap: float) -> NDArray[np.float32]:
+    """Return points about a gap apart on discs of one and a half tangents (N, 3, 2) around centres (N, 3)."""
+    found = [np.zeros((0, 3))]
+    rings = np.clip(np.ceil(1.5 * np.linalg.norm(tangents, axis=1).max(axis=1) / gap), 2, 8).astype(int)
+    for count in np.unique(rings):
+        same = rings == count
+        turn = np.linspace(0.0, 2.0 * np.pi, 6 * count, endpoint=False)
+        disc = np.stack([np.cos(turn), np.sin(turn)])
+        disc = np.concatenate([1.5 * (k + 1) / count * disc for k in range(count)], axis=1)
+        found.append((means[same, None] + np.einsum("nij,jk->nki", tangents[same], disc)).reshape(-1, 3))
+    return np.concatenate(found).astype(np.float32)
