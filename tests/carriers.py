@@ -432,9 +432,10 @@ def render(
     few, share = (0.08, 0.75) if wide < 5.0 else (0.012, 0.95)
     rows: list[tuple[Array, Array, Array, int]] = []
     for prim in prims:
-        x, face = trimesh.sample.sample_surface(
+        found: Any = trimesh.sample.sample_surface(
             prim.mesh, int(1.3 * prim.mesh.area / pitch**2), seed=int(rng.integers(2**31))
         )
+        x, face = found
         x, n = x @ prim.turn.T + prim.at, prim.mesh.face_normals[face] @ prim.turn.T
         hidden = np.zeros(len(x), dtype=bool)
         for other in prims:

@@ -61,7 +61,8 @@ def cut_at(sections: Sections, boundary: Boundary, gap: float) -> Cut:
     height, shift, reach, rough = x[:, 2] - boundary.height, np.zeros(3), 0.5 * sections.layer, False
     if boundary.kind == "top":
         span = max((boundary.reach + 1.5) * sections.layer, 0.03 * sections.size)
-        outside = ~ndimage.binary_dilation(contact, iterations=2)[i, j]
+        within: Any = ndimage.binary_dilation(contact, iterations=2)
+        outside = ~within[i, j]
         flat = np.flatnonzero(outside & (np.abs(height) < span) & (np.abs(normal[:, 2]) > 0.8))
         spread = 0.5 * pitch
         if len(flat) > 10:
@@ -76,7 +77,8 @@ def cut_at(sections: Sections, boundary: Boundary, gap: float) -> Cut:
         reach, rough = float(np.clip(4.0 * spread, 0.3 * pitch, span)), spread > 0.5 * pitch
     lying = (np.abs(height) <= reach) & (np.abs(normal[:, 2]) > 0.75)
     if rough:
-        lying &= ~(ndimage.binary_erosion(contact, iterations=2)[i, j] & (height > 0.3 * reach))
+        core: Any = ndimage.binary_erosion(contact, iterations=2)
+        lying &= ~(core[i, j] & (height > 0.3 * reach))
     above = (height > 0.0) & ~lying
     kept = np.flatnonzero(above)
     if len(kept) > 50:

@@ -160,7 +160,7 @@ def _outline(corners: Array, count: int) -> Array:
     return corners[i] + edge[i] * ((at - along[i]) / np.maximum(along[i + 1] - along[i], 1e-12))[:, None]
 
 
-def filled(mask: Mask) -> Mask:
+def filled(mask: Any) -> Mask:
     """Return cells with the holes between them."""
     return np.asarray(ndimage.binary_fill_holes(mask))
 
@@ -187,7 +187,7 @@ class Sections:
         """Spread every splat over its disc to one and a half standard deviations, and fill the layers."""
         side = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
         side /= np.linalg.norm(side)
-        self.basis = np.stack([side, np.cross(axis, side), axis])
+        self.basis: Array = np.stack([side, np.cross(axis, side), axis]).astype(np.float64)
         """Rows: two unit vectors across the axis, and the axis."""
         self.surface = surface.turned(self.basis)
         """The surface in this basis."""
@@ -302,7 +302,8 @@ class Sections:
             below = filled(ndimage.binary_closing(under, WIDE))
             if below.sum() < 1.1 * above.sum():
                 continue
-            free = below & ~ndimage.binary_dilation(above, DISC)
+            beside: Any = ndimage.binary_dilation(above, DISC)
+            free = below & ~beside
             if free.sum() < 20:
                 continue
             cover = float((ndimage.binary_closing(level, DISC) & free).sum() / free.sum())

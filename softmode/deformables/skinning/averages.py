@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -139,7 +139,7 @@ class _Grid:
         occupied = np.zeros(self.shape, dtype=bool)
         occupied[tuple(cell.T)] = True
         # A cell's cubics reach one node before it and two behind.
-        nodes = ndimage.binary_dilation(occupied, np.ones((4, 4, 4)), origin=(-1, -1, -1))
+        nodes: Any = ndimage.binary_dilation(occupied, np.ones((4, 4, 4)), origin=-1)
         self.number = np.full(nodes.size, -1, dtype=np.int32)
         place = np.flatnonzero(nodes)
         self.number[place] = np.arange(len(place))
