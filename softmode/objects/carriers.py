@@ -342,7 +342,7 @@ class Sections:
             "level": ramp(cover, 0.18, 0.42),
             "free": ramp(around + 0.3 * contrast, 0.7, 0.85),
             "convex": ramp(float(below.sum()) / max(hull, 1.0), 0.6, 0.8),
-            "stands": ramp(radius / rise, 0.17, 0.3) * ramp(steady, 0.03, 0.08),
+            "stands": ramp(radius / rise, 0.17, 0.3) * ramp(steady, 0.0, 0.05),
             "over": ramp(-lean / max(radius, 1e-9), -1.6, -1.1),
             "plain": ramp(plain, 0.45, 0.6),
             "carrier": ramp(max(contrast, ramp(prism, 0.6, 0.85), ramp(legs, 0.5, 0.7)), 0.1, 0.5),
