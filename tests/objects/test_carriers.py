@@ -41,9 +41,9 @@ def test_object_is_taken_without_its_carrier_and_closed() -> None:
     assert int(below.told["floor_splats"]) > 0  # a lid
 
 
-@pytest.mark.parametrize("seed", [18, 5])
+@pytest.mark.parametrize("seed", [5, 4])
 def test_look_alikes_stay_whole(seed: int) -> None:
-    """A block with a handle, and a flat car: nothing is cut."""
+    """A block with a handle, and a car with skirts: nothing is cut."""
     made = bare(seed, count=FEW)
     choice = choose_part(made.splats, "thickest")
     assert "carrier" not in choice.told and choice.told["floor_splats"] == 0
@@ -70,7 +70,7 @@ def test_the_fullest_of_two_planes_is_the_ground() -> None:
 
 def test_bad_captures_are_refused() -> None:
     """Nothing but ground encloses nothing; a candidate that is not there is refused with those that are."""
-    made = bare(103, count=FEW)
+    made = bare(5, count=FEW)
     ground = sheet(0.3, 0.3, 3e-3)
     config = ObjectConfig(splat=ground)
     with pytest.raises(AssetError, match="no volume"):
