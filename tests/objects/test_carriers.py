@@ -41,7 +41,7 @@ def test_object_is_taken_without_its_carrier_and_closed() -> None:
     assert int(below.told["floor_splats"]) > 0  # a lid
 
 
-@pytest.mark.parametrize("seed", [5, 4])
+@pytest.mark.parametrize("seed", [5, 25])
 def test_look_alikes_stay_whole(seed: int) -> None:
     """A block with a handle, and a car with skirts: nothing is cut."""
     made = bare(seed, count=FEW)
