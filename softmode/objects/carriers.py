@@ -321,6 +321,7 @@ class Sections:
         hull, corners = _hull_of(below)
         far = ndimage.distance_transform_edt(~above)
         margin: Any = ndimage.map_coordinates(far, _outline(corners, 240).T, order=1, mode="nearest")
+        around = float((margin > max(2.5, 0.05 * np.sqrt(below.sum()))).mean())
         area, outline = _hull_of(above)
         radius = np.sqrt(area / np.pi)
         bulk = np.where(np.arange(len(self.areas)) > k + reach, self.areas, 0.0)
@@ -330,8 +331,6 @@ class Sections:
         plain, coarse, _ = self.look(-np.inf, self.heights[k] - self.layer)
         plain_above, fine, share = self.look(self.heights[k] + self.layer)
         contrast = max(ramp(plain - plain_above, 0.15, 0.4), ramp(coarse / fine, 1.8, 3.5))
-        # Where it is of the same make as what is above, only a wide margin tells it from a hood.
-        around = float((margin > max(2.5, (0.1 - 0.05 * contrast) * np.sqrt(below.sum()))).mean())
         extent = max(float(np.ptp(np.argwhere(above), axis=0).max()) * self.cell, self.heights[-1] - self.heights[k])
         held, most = float(bulk.sum() / self.areas.sum()), extent / self.size
         steady = _edge_distance(outline, centre) / rise
@@ -349,9 +348,9 @@ class Sections:
             "carrier": ramp(max(contrast, ramp(prism, 0.6, 0.85), ramp(legs, 0.5, 0.7)), 0.1, 0.5),
             "smaller": ramp(-float(above.sum() / below.sum()), -0.95, -0.85),
             "enough": ramp(share, 0.02, 0.06) * ramp(held, 0.01, 0.04) * ramp(most, 0.18, 0.35),
-            "unlike": 1.0 - 0.2 * (plain_above > 0.9),  # a boxy thing on a box: a doubt is named
         }
-        score = float(np.prod(list(why.values())))
+        # A boxy thing on a box may be the hood of a car: a doubt is named.
+        score = min(float(np.prod(list(why.values()))), 0.99 * SURE if plain_above > 0.9 else 1.0)
         why |= {
             "steady": steady,
             "held": held,

@@ -41,10 +41,9 @@ def test_object_is_taken_without_its_carrier_and_closed() -> None:
     assert int(below.told["floor_splats"]) > 0  # a lid
 
 
-@pytest.mark.parametrize("seed", [5, 25])
-def test_look_alikes_stay_whole(seed: int) -> None:
-    """A block with a handle, and a car with skirts: nothing is cut."""
-    made = bare(seed, count=FEW)
+def test_a_block_with_a_handle_stays_whole() -> None:
+    """A handle stands on its block, but is too little of it to be an object."""
+    made = bare(5, count=FEW)
     choice = choose_part(made.splats, "thickest")
     assert "carrier" not in choice.told and choice.told["floor_splats"] == 0
     assert np.isin(choice.number, choice.taken)[made.label == OBJECT].mean() > 0.97
