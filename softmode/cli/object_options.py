@@ -33,8 +33,9 @@ class ObjectOptions:
     """Axis of the file that points up; -y for splats, +y for glTF, +z for the rest."""
     crop: tuple[float, float, float, float, float, float] | None = None
     """Box x0 y0 z0 x1 y1 z1 of a splat file, once turned up; what is outside is dropped."""
-    part: Literal["thickest", "tallest", "largest", "all"] | None = None
-    """Which separate part of a splat file is the object; the thickest."""
+    part: Literal["thickest", "tallest", "largest", "all"] | tuple[int, ...] | None = None
+    """Which separate part of a splat file is the object: the thickest without what carries it, or numbers of the
+    candidates of `softmode splat show`, like 1 2."""
     pose: Literal["stable", "captured"] | None = None
     """Lay what cannot stand on its stable side (stable), or leave it as it is."""
     resolution: int | None = None

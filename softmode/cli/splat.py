@@ -11,6 +11,7 @@ from softmode.checks import require_number
 from softmode.cli.common import bar_interval, quiet_warp, warp_device
 from softmode.errors import AssetError, ConfigError
 from softmode.files import check_place
+from softmode.stages import stage
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -133,8 +134,8 @@ class SplatShow:
     """Axis of the file that points up; -y if omitted."""
     crop: tuple[float, float, float, float, float, float] | None = None
     """Box x0 y0 z0 x1 y1 z1 of the file, once turned up, outside which splats are dropped."""
-    part: Literal["thickest", "tallest", "largest", "all"] = "thickest"
-    """Which of the separate parts is the object."""
+    part: Literal["thickest", "tallest", "largest", "all"] | tuple[int, ...] = "thickest"
+    """Which of the separate parts is the object: a rule, or numbers of candidates on the sheet, like 1 2."""
 
     def run(self) -> int:
         """Look, draw, write; return the exit code."""
@@ -144,17 +145,22 @@ class SplatShow:
         out = self.out if self.out is not None else Path(f"{self.file.stem}_sheet.png")
         check_place(out, "sheet", make_folders=False)
         up = self.up or "-y"
-        splats = read_splats(self.file).oriented(up)
+        with stage(f"reading {self.file.name}"):
+            splats = read_splats(self.file).oriented(up)
         if self.crop is not None:
             splats = splats.cropped(self.crop[:3], self.crop[3:])
         with quiet_warp():
-            from softmode.viz.splat_sheet import survey_splats, write_splat_sheet
+            from softmode.viz.splat_sheet import candidate_lines, survey_splats, write_splat_sheet
 
             survey = survey_splats(splats, ObjectConfig(part=self.part))
+            print("\n".join(candidate_lines(survey)), flush=True)
             taken = f"up {up} of the file{'' if self.up else ' (a guess: change it with --up)'}; z is up here"
-            write_splat_sheet(out, survey, title=self.file.name, notes=[taken, f"part {self.part}"])
+            with stage("drawing the sheet"):
+                write_splat_sheet(out, survey, title=self.file.name, notes=[taken])
         kept = int(survey.kept.sum())
-        print(f"{len(survey.parts)} parts; {kept} of {splats.count} splats would be taken")
+        print(
+            f"{kept} of {splats.count} splats would be taken, and {survey.choice.told.get('floor_splats', 0)} close it"
+        )
         if survey.fill is None:
             print(f"it cannot be built: {survey.why}")
         print(f"wrote {out}")

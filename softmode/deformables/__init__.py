@@ -50,8 +50,8 @@ if TYPE_CHECKING:
     from softmode.deformables.reduction.reduced_stiffness import elastic_modes as elastic_modes
     from softmode.deformables.reduction.report import BodyReport as BodyReport
     from softmode.deformables.reduction.report import report_body as report_body
+    from softmode.deformables.skinning.averages import average_basis as average_basis
     from softmode.deformables.skinning.skin_splats import SkinSplats as SkinSplats
-    from softmode.deformables.skinning.skin_splats import average_basis as average_basis
     from softmode.deformables.skinning.skinning_adjoint import AdjointSkinning as AdjointSkinning
     from softmode.deformables.solver.attachments import Attachment as Attachment
     from softmode.deformables.solver.attachments import attach as attach

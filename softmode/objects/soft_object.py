@@ -15,7 +15,7 @@ from softmode.deformables.contact.dents import DentWeights, dent_weights
 from softmode.deformables.materials.material import Material
 from softmode.deformables.reduction.cache import cached
 from softmode.deformables.reduction.report import Finding, object_findings
-from softmode.deformables.skinning.skin_splats import average_basis
+from softmode.deformables.skinning.averages import average_basis
 from softmode.errors import ConfigError, GraspError
 from softmode.files import read_archive, write_archive
 from softmode.objects.config import ObjectConfig
