@@ -110,7 +110,7 @@ def write_splat_sheet(path: str | os.PathLike[str], survey: SplatSurvey, *, titl
         place = draw_view(axes, heading, marked, corner, "", "")
         for k in range(1, number.max() + 1):
             x, y = place(np.median(splats.means[number == k], axis=0))
-            frame = {"boxstyle": "circle", "facecolor": COLORS[k - 1], "edgecolor": "white"}
+            frame = {"boxstyle": "circle", "facecolor": COLORS[min(k, len(COLORS)) - 1], "edgecolor": "white"}
             axes.text(x, y, str(k), color="white", weight="bold", ha="center", va="center", bbox=frame)
         draw_view(figure.add_subplot(grid[1, 1]), "what is taken", thing, corner, "", "")
         _draw_fill(figure.add_subplot(grid[1, 2]), survey, thing)
