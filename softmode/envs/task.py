@@ -21,9 +21,10 @@ from softmode.deformables.model.structs import filled
 from softmode.deformables.reduction.build_body import Progress
 from softmode.deformables.tools.parameters import set_parameters
 from softmode.envs import task_kernels as kernels
-from softmode.envs.cameras import FollowCamera, overview, square_camera, wrist_camera
+from softmode.envs.cameras import overview, square_camera, wrist_camera
 from softmode.envs.clutter import Arcs, clutter_parameters
 from softmode.envs.end_reason import EndReason
+from softmode.envs.film import TaskFilm
 from softmode.envs.observation import (
     ObservationLayout,
     Segment,
@@ -48,10 +49,6 @@ from softmode.splats.splats import Splats
 
 FALL = 0.05
 """How far under its resting height on the table object 0 counts as dropped [m]."""
-HAND = 0.07
-"""Radius about the tool that the following camera shows [m]."""
-MARKER = 0.02
-"""Radius about the goal that the following camera shows [m]."""
 MATERIAL = ("youngs_modulus", "poissons_ratio", "density", "friction", "scale")
 """Parameters of the soft bodies."""
 
@@ -105,6 +102,10 @@ class Task:
     takes_several: ClassVar[bool] = False
     """Whether worlds may have several objects of the set (`ObjectSet.per_world`): object 0 is that of the task, the
     others lie beside it, see `other_arcs`."""
+    filmed_across: ClassVar[bool] = False
+    """Whether the film's first camera looks across the direction in which the fingers close."""
+    goal_ring: ClassVar[bool] = False
+    """Whether films show the goal as a ring about where the object is to be, in place of the marker."""
     any_robot: ClassVar[bool] = False
     """Whether the task has been tried with robots from files, which `robot` names."""
     kernels: ClassVar[Any] = None
@@ -170,7 +171,7 @@ class Task:
     def _lay_out(self) -> None:
         """Lay out observations and parameters, and allocate what a step writes."""
         config, world_count = self.config, self.world_count
-        self._follow = FollowCamera(self.render_cameras()[0], world_count)
+        self._film = TaskFilm(self)
         self.device = self.scene.device
         self._check_objects()
         kept = [self._kept(material) for material in self.scene.materials]
@@ -665,30 +666,11 @@ class Task:
 
     def draw_film(self) -> NDArray[np.uint8]:
         """Return the pictures of the film cameras side by side, uint8 (world_count, edge, cameras * edge, 3)."""
-        scene, film = self.scene, self.scene.film
-        if film is not None:
-            time = self.elapsed.numpy() / self.config.scene.control_hz
-            film.aim(film.cameras[0].name, self._follow.matrices(self.in_focus(), time))
-        pictures = scene.draw_film().numpy()
-        cameras = pictures.reshape(-1, self.world_count, *pictures.shape[1:])
-        return np.concatenate(list(cameras), axis=2)
+        return self._film.draw()
 
     def forget_film(self, mask: NDArray[np.bool_]) -> None:
-        """Let the following camera jump to its place in the masked worlds, shape (world_count,)."""
-        self._follow.forget(mask)
-
-    def in_focus(self) -> NDArray[np.float64]:
-        """Return balls (x, y, z, radius) [m] that the following camera shows, shape (world_count, K, 4).
-
-        They are object 0, the hand, and the goal if a marker shows it.
-        """
-        scene = self.scene
-        scale = self.table.values.numpy()[:, self.table.column("scale")]
-        radius = np.array([thing.radius for thing in scene.members])[scene.member] * scale
-        balls = [(scene.object_position.numpy()[:, 0], radius), (scene.controller.tool_pose.numpy()[:, :3], HAND)]
-        if scene.marker is not None:
-            balls.append((scene.marker_place.numpy()[:, :3], MARKER))
-        return np.stack([np.column_stack([x, np.broadcast_to(r, len(x))]) for x, r in balls], axis=1)
+        """Let the following cameras jump to their place in the masked worlds, shape (world_count,)."""
+        self._film.forget(mask)
 
     # -- the step -----------------------------------------------------------------------------------------------------
 

@@ -82,6 +82,7 @@ class LiftSoft(Task):
     config_class = LiftSoftConfig
     kernels = kernels
     grasps = True
+    filmed_across = goal_ring = True
     takes_sets = True
     takes_several = True
     any_robot = True

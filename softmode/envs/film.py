@@ -1,0 +1,75 @@
+"""`TaskFilm`: the pictures of a task that people look at: one camera that follows the object, one that has the arm."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from softmode.envs.cameras import FollowCamera
+from softmode.envs.markers import GREEN
+
+if TYPE_CHECKING:
+    from softmode.envs.task import Task
+
+FINGERS = 0.045
+"""Radius about the tool that the following camera shows [m]."""
+RING = 1.12
+"""Radius of the ring about the goal, over that of the object."""
+
+
+class TaskFilm:
+    """Aims the film cameras of a task's scene in every frame.
+
+    The first camera shows object 0 and the fingers; where the task asks for it, it looks across the direction in which
+    they close. The second one shows the arm, the object and the goal, as near as that allows.
+
+    Args:
+        task: The task, with its scene.
+    """
+
+    def __init__(self, task: Task) -> None:
+        """Start without a place."""
+        self._task = task
+        near, far = task.render_cameras()
+        self._near = FollowCamera(near, task.world_count)
+        self._far = FollowCamera(far, task.world_count, room=1.06, seconds=0.5)
+
+    def forget(self, mask: NDArray[np.bool_]) -> None:
+        """Let the cameras jump to their place in the masked worlds, shape (world_count,)."""
+        self._near.forget(mask)
+        self._far.forget(mask)
+
+    def draw(self) -> NDArray[np.uint8]:
+        """Return the pictures side by side, uint8 (world_count, edge, 2 * edge, 3)."""
+        task, scene = self._task, self._task.scene
+        film, goal = scene.film, scene.marker_place.numpy()[:, :3].astype(float)
+        if film is not None:
+            time = task.elapsed.numpy() / task.config.scene.control_hz
+            tool, thing = scene.controller.tool_pose.numpy().astype(float), self._object()
+            closing = Rotation.from_quat(tool[:, 3:]).apply([0.0, 1.0, 0.0]) if task.filmed_across else None
+            near = np.stack([thing, _balls(tool[:, :3], FINGERS)], axis=1)
+            arm = film.corners(scene.state)
+            far = np.concatenate([_balls(arm, 0.0), thing[:, None]], axis=1)
+            if scene.marker is not None:
+                far = np.concatenate([far, _balls(goal[:, None], 0.02)], axis=1)
+            film.aim(film.cameras[0].name, self._near.matrices(near, time, closing))
+            film.aim(film.cameras[1].name, self._far.matrices(far, time))
+            if task.goal_ring:
+                film.circle(goal, RING * thing[:, 3], GREEN)
+        pictures = scene.draw_film().numpy()
+        return np.concatenate(list(pictures.reshape(-1, task.world_count, *pictures.shape[1:])), axis=2)
+
+    def _object(self) -> NDArray[np.float64]:
+        """Return the ball about object 0 of every world (x, y, z, radius) [m], shape (world_count, 4)."""
+        task, scene = self._task, self._task.scene
+        scale = task.table.values.numpy()[:, task.table.column("scale")]
+        radius = np.array([thing.radius for thing in scene.members])[scene.member] * scale
+        return np.column_stack([scene.object_position.numpy()[:, 0], radius]).astype(float)
+
+
+def _balls(centers: NDArray[np.float64], radius: float) -> NDArray[np.float64]:
+    """Return balls (x, y, z, radius) [m], shape (..., 4)."""
+    return np.concatenate([centers, np.full((*centers.shape[:-1], 1), radius)], axis=-1)
