@@ -119,9 +119,13 @@ def warn_of_env(env: Any) -> None:
 
 
 def warn_of(thing: SoftObject, arm: ArmDescription | TableRobot | None = None) -> None:
-    """Print, on stderr, what the user should know about an object that an arm, if any, is to take."""
+    """Print, on stderr, what the user should know about an object that an arm, if any, is to take, and whose it is."""
+    from softmode.objects.captures import credit
     from softmode.robots.jaws import ParallelJaw
 
+    file = None if thing.config is None or thing.config.file is None else thing.config.file[1]
+    if by := credit(file):
+        print(f"softmode: {by}", file=sys.stderr)
     for finding in thing.findings(jaw=None if arm is None else ParallelJaw.of(arm)):
         print(f"softmode: {finding_line(finding, sys.stderr)}", file=sys.stderr, flush=True)
 

@@ -26,6 +26,7 @@ class ObjectsList:
 
     def run(self) -> int:
         """Print a line per preset."""
+        from softmode.objects.captures import CAPTURES
         from softmode.objects.shapes.presets import PRESETS
 
         print(f"{'name':10} {'E [Pa]':>8} {'nu':>5} {'kg/m^3':>7} {'friction':>9}  what")
@@ -35,6 +36,8 @@ class ObjectsList:
                 f"{name:10} {made.youngs_modulus:8.0e} {made.poissons_ratio:5.2f} {made.density:7.0f}"
                 f" {made.friction:9.2f}  {preset.what} ({preset.why})"
             )
+        for name, by in CAPTURES.items():
+            print(f"{name:10} a capture, with the material of the task: {by}")
         return 0
 
 

@@ -96,9 +96,10 @@ class SplatInfo:
         """Print count, degree, box, scales and opacities."""
         import numpy as np
 
+        from softmode.objects.captures import bundled
         from softmode.splats.formats import read_splats
 
-        splats = read_splats(self.file)
+        splats = read_splats(bundled(self.file) or self.file)
         low, high = splats.bounds()
         deciles = [0.1, 0.5, 0.9]
 
@@ -138,13 +139,14 @@ class SplatShow:
 
     def run(self) -> int:
         """Look, draw, write; return the exit code."""
+        from softmode.objects.captures import bundled
         from softmode.objects.config import ObjectConfig
         from softmode.splats.formats import read_splats
 
         out = self.out if self.out is not None else Path(f"{self.file.stem}_sheet.png")
         check_place(out, "sheet", make_folders=False)
         up = self.up or "-y"
-        splats = read_splats(self.file).oriented(up)
+        splats = read_splats(bundled(self.file) or self.file).oriented(up)
         if self.crop is not None:
             splats = splats.cropped(self.crop[:3], self.crop[3:])
         with quiet_warp():

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 FINGERS = 0.045
 """Radius about the tool that the following camera shows [m]."""
+POINT = 0.006
+"""Radius about points of the object's surface that it shows [m]."""
 RING = 1.12
 """Radius of the ring about the goal, over that of the object."""
 
@@ -48,26 +50,26 @@ class TaskFilm:
         film, goal = scene.film, scene.marker_place.numpy()[:, :3].astype(float)
         if film is not None:
             time = task.elapsed.numpy() / task.config.scene.control_hz
-            tool, thing = scene.controller.tool_pose.numpy().astype(float), self._object()
+            tool, thing = scene.controller.tool_pose.numpy().astype(float), self._points()
             closing = Rotation.from_quat(tool[:, 3:]).apply([0.0, 1.0, 0.0]) if task.filmed_across else None
-            near = np.stack([thing, _balls(tool[:, :3], FINGERS)], axis=1)
-            arm = film.corners(scene.state)
-            far = np.concatenate([_balls(arm, 0.0), thing[:, None]], axis=1)
+            near = np.concatenate([thing, _balls(tool[:, None, :3], FINGERS)], axis=1)
+            far = np.concatenate([_balls(film.corners(scene.state), 0.0), thing], axis=1)
             if scene.marker is not None:
                 far = np.concatenate([far, _balls(goal[:, None], 0.02)], axis=1)
             film.aim(film.cameras[0].name, self._near.matrices(near, time, closing))
             film.aim(film.cameras[1].name, self._far.matrices(far, time))
             if task.goal_ring:
-                film.circle(goal, RING * thing[:, 3], GREEN)
+                scale = task.table.values.numpy()[:, task.table.column("scale")]
+                radius = np.array([thing.radius for thing in scene.members])[scene.member] * scale
+                film.circle(goal, RING * radius, GREEN)
         pictures = scene.draw_film().numpy()
         return np.concatenate(list(pictures.reshape(-1, task.world_count, *pictures.shape[1:])), axis=2)
 
-    def _object(self) -> NDArray[np.float64]:
-        """Return the ball about object 0 of every world (x, y, z, radius) [m], shape (world_count, 4)."""
-        task, scene = self._task, self._task.scene
-        scale = task.table.values.numpy()[:, task.table.column("scale")]
-        radius = np.array([thing.radius for thing in scene.members])[scene.member] * scale
-        return np.column_stack([scene.object_position.numpy()[:, 0], radius]).astype(float)
+    def _points(self) -> NDArray[np.float64]:
+        """Return balls (x, y, z, radius) [m] about points of the surface of object 0, shape (world_count, K, 4)."""
+        task = self._task
+        first = task.state.particle_start.numpy()[:: task.state.stride, None]
+        return _balls(task.scene.state.particle_q.numpy()[first + task.points_of_worlds].astype(float), POINT)
 
 
 def _balls(centers: NDArray[np.float64], radius: float) -> NDArray[np.float64]:

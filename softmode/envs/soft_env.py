@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import importlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -15,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from softmode.deformables.model.status import status_reasons
 from softmode.deformables.reduction.build_body import Progress
 from softmode.envs.arguments import (
+    LOOK_ON,
     RENDER_MODES,
     Shortcuts,
     checked_actions,
@@ -37,7 +39,7 @@ from softmode.envs.results import host_view, info_arrays, name_of, observation_a
 from softmode.envs.robots import Robot
 from softmode.envs.task import Task
 from softmode.envs.task_config import ObservationType, TaskConfig
-from softmode.errors import ConfigError
+from softmode.errors import ConfigError, needs_extra
 from softmode.pause import collector_paused
 from softmode.vector_check.tensors import map_tree
 
@@ -76,7 +78,8 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
 
     Args:
         obs_type: What ``reset`` and ``step`` return.
-        render_mode: "rgb_array" or None.
+        render_mode: "rgb_array"; "human" for a page in the browser that shows every step, with the extra `[viz]`; or
+            None.
         control_mode: What actions mean.
         splat: Splat file of the object; None for the built-in one.
         size: Longest edge of the object [m].
@@ -93,7 +96,7 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
         AssetError: If the splat file cannot be used.
     """
 
-    metadata = {"render_modes": list(RENDER_MODES), "render_fps": 30}  # noqa: RUF012  (gymnasium's own convention)
+    metadata = {"render_modes": [*RENDER_MODES, LOOK_ON], "render_fps": 30}  # noqa: RUF012  (gymnasium's own convention)
     task_class: ClassVar[type[Task]] = Task
     """The task."""
 
@@ -125,7 +128,12 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
         # What a copy is made from when the environment is pickled; a callback cannot travel.
         place = None if device is None else str(device)
         gym.utils.EzPickle.__init__(self, **vars(given), config=config, device=place, **fields)
-        self.config = checked_config(self.task_class.config_class, config, given, self.task_class.any_robot, fields)
+        self.config = checked_config(
+            self.task_class.config_class, config, given, self.task_class.any_robot, fields, single=True
+        )
+        if render_mode == LOOK_ON:
+            with needs_extra("viz", 'render_mode="human" needs viser'):
+                import viser  # noqa: F401
         self.obs_type, self.render_mode = obs_type, render_mode
         self.metadata = {**self.metadata, "render_fps": round(self.config.scene.control_hz)}
         with collector_paused():
@@ -139,6 +147,7 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
         self.scene, self.device = self.task.scene, self.task.device
         self._begun = False
         """Whether an episode has begun."""
+        self._page: Any = None
         self._object_names = () if self.config.object_set is None else self.config.object_set.names
         self.action_space = self.task.action_space
         self.observation_space = self.task.observation_space()
@@ -158,12 +167,14 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
                 )
             self.set_state(checked_state(given["state"]))
             self.task.begin()
+            self._look_on()
             return self._observe(), self._info()
         given = check_options(self.task.reset_options, given, 1)
         fresh = seed is not None or self._np_random is None
         super().reset(seed=seed)
         seeds = np.array([world_seed(self.np_random)]) if fresh else None
         self.task.reset(seeds=seeds, options=given)
+        self._look_on()
         return self._observe(), self._info()
 
     def step(self, action: ArrayLike) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -178,6 +189,7 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
         actions, _, _, *ends = self._arrays
         write(given, actions)
         self.task.step()
+        self._look_on()
         info = self._info()
         reward, terminated, truncated = take(ends, 0, scalars=True)
         if terminated:
@@ -230,9 +242,27 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return the views of the rendering cameras side by side, uint8 (render_size, 2 render_size, 3)."""
-        if self.render_mode is None:
+        if self.render_mode != "rgb_array":
             return None
         return self.task.draw_film()[0]
+
+    @property
+    def page_url(self) -> str | None:
+        """Where the page of ``render_mode="human"`` is, from the first reset on; None in other modes."""
+        return None if self._page is None else self._page.url
+
+    def close(self) -> None:
+        """End the page, if there is one."""
+        if self._page is not None:
+            self._page.close()
+            self._page = None
+
+    def _look_on(self) -> None:
+        """Show the present state to who looks on."""
+        if self.render_mode == LOOK_ON:
+            if self._page is None:  # loaded by name: a room above this one
+                self._page = importlib.import_module("softmode.view.env_page").EnvPage(self)
+            self._page.show()
 
     def _observe(self) -> Any:
         """Return the observation in arrays of its own."""

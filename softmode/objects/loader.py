@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.materials.material import Material, warn_of_units
 from softmode.deformables.reduction.cache import cached_body
+from softmode.objects.captures import bundled
 from softmode.objects.config import ObjectConfig
 from softmode.objects.object_file import file_kind, read_object, surface_cover
 from softmode.objects.pipeline import body_key, build_standing, dressed
@@ -40,9 +41,9 @@ def load(
     """Return a soft object: read or make its splats, build or recall its body.
 
     Args:
-        source: A configuration; the name of a preset, such as "mug"; a file of splats, of a point cloud, of a mesh, of
-            a radiance field or of a body, or an OpenUSD stage with any of these but a field; a body; splats, a field or
-            a mesh (also of trimesh) in memory; None for the built-in plush.
+        source: A configuration; the name of a preset, such as "mug", or of the capture "playbot"; a file of splats, of
+            a point cloud, of a mesh, of a radiance field or of a body, or an OpenUSD stage with any of these but a
+            field; a body; splats, a field or a mesh (also of trimesh) in memory; None for the built-in plush.
         material: What it is made of; None for what its file or preset says. The body is built for its Poisson's ratio,
             unless `BuildOptions` name one.
         progress: Passed to :func:`softmode.deformables.reduction.build_body.build_body`.
@@ -97,6 +98,8 @@ def object_config(source: Source | str | os.PathLike[str] | None, **options: Any
     if isinstance(source, str | os.PathLike):
         if os.fspath(source) in PRESETS:
             return ObjectConfig(preset=os.fspath(source), **options)
+        if bundled(source):
+            return ObjectConfig(splat=source, **options)
         kind = file_kind(source)
         return ObjectConfig(**{"splat" if kind == "points" else kind: Path(source)}, **options)
     if isinstance(source, Splats):
