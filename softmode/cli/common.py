@@ -8,6 +8,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import fields
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 from softmode.errors import ConfigError
@@ -80,6 +81,18 @@ def optional_argument() -> Any:
     import tyro
 
     return tyro.conf.Positional
+
+
+def one_place(argument: Path | None, option: Path | None) -> Path:
+    """Return the file to write, which is given as an argument or as the option -o.
+
+    Raises:
+        ConfigError: If it is given both ways or not at all.
+    """
+    if (argument is None) == (option is None):
+        what = "no file to write is given" if option is None else f"{argument} and {option} are two files to write"
+        raise ConfigError(what, hint="name one, like -o out/toy.npz")
+    return option if argument is None else argument  # type: ignore[return-value]
 
 
 def finding_line(finding: Finding, stream: TextIO) -> str:

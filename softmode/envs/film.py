@@ -29,12 +29,11 @@ class TaskFilm:
     they close. The second one shows the arm, the object and the goal, as near as that allows.
 
     Args:
-        task: The task, with its scene.
+        task: The task.
     """
 
     def __init__(self, task: Task) -> None:
         """Start without a place."""
-        self._task = task
         near, far = task.render_cameras()
         self._near = FollowCamera(near, task.world_count)
         self._far = FollowCamera(far, task.world_count, room=1.06, seconds=0.5)
@@ -44,13 +43,13 @@ class TaskFilm:
         self._near.forget(mask)
         self._far.forget(mask)
 
-    def draw(self) -> NDArray[np.uint8]:
-        """Return the pictures side by side, uint8 (world_count, edge, 2 * edge, 3)."""
-        task, scene = self._task, self._task.scene
+    def draw(self, task: Task) -> NDArray[np.uint8]:
+        """Return the pictures of the task side by side, uint8 (world_count, edge, 2 * edge, 3)."""
+        scene = task.scene
         film, goal = scene.film, scene.marker_place.numpy()[:, :3].astype(float)
         if film is not None:
             time = task.elapsed.numpy() / task.config.scene.control_hz
-            tool, thing = scene.controller.tool_pose.numpy().astype(float), self._points()
+            tool, thing = scene.controller.tool_pose.numpy().astype(float), _points(task)
             closing = Rotation.from_quat(tool[:, 3:]).apply([0.0, 1.0, 0.0]) if task.filmed_across else None
             near = np.concatenate([thing, _balls(tool[:, None, :3], FINGERS)], axis=1)
             far = np.concatenate([_balls(film.corners(scene.state), 0.0), thing], axis=1)
@@ -65,11 +64,11 @@ class TaskFilm:
         pictures = scene.draw_film().numpy()
         return np.concatenate(list(pictures.reshape(-1, task.world_count, *pictures.shape[1:])), axis=2)
 
-    def _points(self) -> NDArray[np.float64]:
-        """Return balls (x, y, z, radius) [m] about points of the surface of object 0, shape (world_count, K, 4)."""
-        task = self._task
-        first = task.state.particle_start.numpy()[:: task.state.stride, None]
-        return _balls(task.scene.state.particle_q.numpy()[first + task.points_of_worlds].astype(float), POINT)
+
+def _points(task: Task) -> NDArray[np.float64]:
+    """Return balls (x, y, z, radius) [m] about points of the surface of object 0, shape (world_count, K, 4)."""
+    first = task.state.particle_start.numpy()[:: task.state.stride, None]
+    return _balls(task.scene.state.particle_q.numpy()[first + task.points_of_worlds].astype(float), POINT)
 
 
 def _balls(centers: NDArray[np.float64], radius: float) -> NDArray[np.float64]:

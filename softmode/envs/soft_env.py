@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from softmode.deformables.model.status import status_reasons
 from softmode.deformables.reduction.build_body import Progress
+from softmode.deformables.tools.gaps import warn_of_overlaps
 from softmode.envs.arguments import (
     LOOK_ON,
     RENDER_MODES,
@@ -157,7 +158,7 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
         """Actions, observation, infos, reward and ends of the last step: always the same memory."""
 
     def reset(self, *, seed: int | None = None, options: Mapping[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Start an episode."""
+        """Start an episode; what starts more than 1 mm inside something else is said in the log "softmode"."""
         given = checked_options(options)
         self._begun = True
         if "state" in given:
@@ -174,6 +175,7 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
         super().reset(seed=seed)
         seeds = np.array([world_seed(self.np_random)]) if fresh else None
         self.task.reset(seeds=seeds, options=given)
+        warn_of_overlaps(self.scene.solver, self.scene.state, self.scene.dt)
         self._look_on()
         return self._observe(), self._info()
 

@@ -666,7 +666,7 @@ class Task:
 
     def draw_film(self) -> NDArray[np.uint8]:
         """Return the pictures of the film cameras side by side, uint8 (world_count, edge, cameras * edge, 3)."""
-        return self._film.draw()
+        return self._film.draw(self)
 
     def forget_film(self, mask: NDArray[np.bool_]) -> None:
         """Let the following cameras jump to their place in the masked worlds, shape (world_count,)."""

@@ -22,7 +22,7 @@ from softmode.deformables.model.neighbours import listed, movable_bodies
 from softmode.deformables.model.status import status_reasons
 from softmode.deformables.solver.observables import ReducedObservableKind
 from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
-from softmode.deformables.tools.gaps import rigid_gaps
+from softmode.deformables.tools.gaps import rigid_gaps, warn_of_overlaps
 from softmode.deformables.tools.grips import GripOptions, Grips, add_grip_slots
 from softmode.errors import ConfigError
 from softmode.objects.placed import Placed
@@ -185,9 +185,10 @@ class SplatScene:
     # -- time and pictures --------------------------------------------------------------------------------------------
 
     def step(self) -> None:
-        """Take the physics steps of one frame."""
+        """Take the physics steps of one frame; the first time, say what starts inside something else."""
         if self._step_graph is None:
             self._step_graph = capture_step(self, self._steps)
+            self.notes += warn_of_overlaps(self.solver, self.state, self.dt)
         self._step_graph.launch()
 
     def _steps(self) -> None:
