@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 from softmode.errors import ConfigError
+from softmode.stages import moved
 
 if TYPE_CHECKING:
     from softmode.deformables.reduction.report import Finding
@@ -58,6 +59,7 @@ class _KernelCount:
             from tqdm import tqdm
 
             what, terminal = "compiling kernels (first run only, a minute or two)", sys.stderr.isatty()
+            moved()
             if not terminal:
                 print(what, file=sys.stderr, flush=True)
             self._bar = tqdm(desc=what, unit=" modules", leave=False, disable=not terminal)
@@ -163,7 +165,7 @@ def same_fields(options: Any, kind: type) -> dict[str, Any]:
 
 def bar_interval() -> float:
     """Return how often a progress bar is drawn [s]: smoothly on a terminal, seldom in a log."""
-    return 0.1 if sys.stderr.isatty() else 5.0
+    return 0.1 if sys.stderr.isatty() else 2.5
 
 
 class BuildBar:
@@ -194,6 +196,7 @@ class BuildBar:
             self._bar = tqdm(total=100, desc="building the body", unit="%", mininterval=bar_interval())
         self._bar.set_postfix_str(stage, refresh=False)
         self._bar.update(round(100.0 * fraction) - self._bar.n)
+        moved()
         if self._also is not None:
             self._also(stage, fraction)
 

@@ -46,6 +46,7 @@ from softmode.scenes.table_scene import GAP, TableScene, TableSceneConfig
 from softmode.splats.cameras.camera import CameraOptions
 from softmode.splats.raster.pinhole import PinholeCamera
 from softmode.splats.splats import Splats
+from softmode.stages import stage
 
 FALL = 0.05
 """How far under its resting height on the table object 0 counts as dropped [m]."""
@@ -150,7 +151,7 @@ class Task:
             cameras += self.render_cameras()  # for recorders, in fixed places
         labelled = "segmentation" in config.image_outputs
         options = CameraOptions(mesh_samples=config.mesh_samples, segmentation=labelled)
-        with compiling_aside(device):
+        with stage("making the environment"), compiling_aside(device):
             self.scene = TableScene(
                 self.scene_config(),
                 world_count=world_count,

@@ -21,6 +21,7 @@ from softmode.objects.source import object_source
 from softmode.radiance.grid import RadianceGrid
 from softmode.splats.colored_mesh import ColoredMesh
 from softmode.splats.splats import Splats
+from softmode.stages import stage
 
 if TYPE_CHECKING:
     import trimesh
@@ -72,7 +73,8 @@ def load(
             contact_radius=config.contact_radius,
             config=config,
         )
-    parts = object_source(config)
+    with stage(f"reading {config.kind if config.file is None else config.file[1].name}"):
+        parts = object_source(config)
     material = material or config.material
     made = config.for_material(material)
     body = cached_body(body_key(made, parts), lambda: build_standing(made, parts, progress=progress)[0])

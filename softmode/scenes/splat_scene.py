@@ -35,6 +35,7 @@ from softmode.scenes.recording import Recording
 from softmode.scenes.scene import cameras_by_size
 from softmode.splats.cameras.camera import CameraOptions, SplatCamera
 from softmode.splats.raster.pinhole import PinholeCamera
+from softmode.stages import KERNELS, stage
 
 
 @cache
@@ -146,12 +147,11 @@ class SplatScene:
             _say_once(self.notes[0])
         bodies = list({id(thing.body): thing.body for thing in self.objects}.values())
         self.solver: SolverReduced | SolverCoupledReduced
-        if moving:
-            with mujoco_warnings():
-                mujoco = rigid(self.model)
-            self.solver = SolverCoupledReduced(self.model, bodies, options=options, rigid=mujoco)
-        else:
-            self.solver = SolverReduced(self.model, bodies, options=options)
+        with stage(KERNELS), mujoco_warnings():
+            if moving:
+                self.solver = SolverCoupledReduced(self.model, bodies, options=options, rigid=rigid(self.model))
+            else:
+                self.solver = SolverReduced(self.model, bodies, options=options)
         self.state: Any = self.model.state()
         self._scratch, self.control = self.model.state(), self.model.control()
         for state in (self.state, self._scratch):
