@@ -342,3 +342,24 @@ def test_a_process_exits_with_the_code(module: str, tmp_path: Path) -> None:
     assert run.returncode == 2 and run.stdout == ""
     assert run.stderr.count("\n") == 1 and run.stderr.startswith("softmode: error: unknown policy")
     assert listing(tmp_path) == []
+
+
+def test_hints_name_the_commands_own_help(capsys: pytest.CaptureFixture[str]) -> None:
+    """An option that is not there, and a file that is not named or named twice, say where help is."""
+    for words, told in (
+        (["play", "softmode/LiftSoft-v0", "--nonsense"], "softmode play --help"),
+        (["splat", "convert", "a.ply", "--nonsense"], "softmode splat convert --help"),
+    ):
+        with pytest.raises(SystemExit):
+            main(words)
+        assert told in " ".join(capsys.readouterr().err.split())
+    assert main(["splat", "convert", "a.ply"]) == 2
+    assert main(["objects", "export", "mug", "a.ply", "-o", "b.ply"]) == 2
+    assert capsys.readouterr().err.count("-o out/toy.npz") == 2
+
+
+def test_a_film_into_a_folder_that_is_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It is refused before anything is built."""
+    (tmp_path / "out").write_text("")
+    assert main([*PLAY, "-o", str(tmp_path / "out" / "film.mp4")]) == 2
+    assert "film.mp4" in capsys.readouterr().err
