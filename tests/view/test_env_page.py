@@ -1,4 +1,4 @@
-"""The page that shows an environment to people who look on: what is on it, when there is one, and when there is none."""
+"""The page that shows an environment to people who look on: what is on it, and where there can be none."""
 
 from __future__ import annotations
 
