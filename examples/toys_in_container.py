@@ -37,8 +37,12 @@ TOYS = {
     "disc": ObjectConfig(shape="cylinder", extents=(0.08, 0.08, 0.025)),
 }
 FALLING = "large bear,ball,bear,cube,small bear,beam,bear,disc,large bear,ball,small bear,cube,bear".split(",")
-PRESETS = "bread,mug,fish,cushion,bear,banana,glove,sponge,doughnut,block-a,ball,block-b,block-c".split(",")
-"""What falls instead, largest first."""
+PRESETS = {
+    **dict.fromkeys(("block-a", "block-b", "block-c"), 0.048),
+    **{"ball": 0.055, "doughnut": 0.07},
+    **dict.fromkeys(("bread", "mug", "fish", "sponge", "cushion", "bear", "banana", "glove"), 0.085),
+}
+"""What falls instead, in order, and how large it is [m]."""
 LAYER = ((0.0, 0.0), (0.06, 0.06), (-0.06, -0.06), (0.06, -0.06), (-0.06, 0.06))
 """Where the five of a layer start [m]."""
 
@@ -53,7 +57,7 @@ def make_scene(splat: str | None, seed: int, size: int, device: str | None, pres
         place = wp.transform((x * (HALF + 0.5 * WALL), y * (HALF + 0.5 * WALL), 0.5 * HEIGHT), upright)
         hx, hy = (0.5 * WALL, HALF + WALL) if x else (HALF + WALL, 0.5 * WALL)
         world.add_shape_box(-1, xform=place, hx=hx, hy=hy, hz=0.5 * HEIGHT, color=(0.50, 0.36, 0.24))
-    toys = {name: ObjectConfig(preset=name, size=0.085) for name in PRESETS} if presets else TOYS
+    toys = {name: ObjectConfig(preset=name, size=edge) for name, edge in PRESETS.items()} if presets else TOYS
     configs = {name: replace(toy, surface_count=150, build=BUILD) for name, toy in toys.items()}
     if splat and not presets:
         configs["bear"] = replace(configs["bear"], splat=splat)

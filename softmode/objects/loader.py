@@ -73,7 +73,7 @@ def load(
             contact_radius=config.contact_radius,
             config=config,
         )
-    with stage(f"reading {config.kind if config.file is None else config.file[1].name}"):
+    with stage(f"reading {config.preset or (config.kind if config.file is None else config.file[1].name)}"):
         parts = object_source(config)
     material = material or config.material
     made = config.for_material(material)
