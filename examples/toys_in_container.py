@@ -38,11 +38,11 @@ TOYS = {
 }
 FALLING = "large bear,ball,bear,cube,small bear,beam,bear,disc,large bear,ball,small bear,cube,bear".split(",")
 PRESETS = {
-    **dict.fromkeys(("block-a", "block-b", "block-c"), 0.048),
-    **{"ball": 0.055, "doughnut": 0.07},
-    **dict.fromkeys(("bread", "mug", "fish", "sponge", "cushion", "bear", "banana", "glove"), 0.085),
+    **{"bread": 0.085, "mug": 0.085, "banana": 0.085, "fish": 0.085, "doughnut": 0.07},
+    **{"ball": 0.055, "block-a": 0.048, "block-b": 0.048, "block-c": 0.048, "sponge": 0.085},
+    **{"bear": 0.085, "cushion": 0.085, "glove": 0.085},
 }
-"""What falls instead, in order, and how large it is [m]."""
+"""What falls instead, the heavy before the light, and how large it is [m]."""
 LAYER = ((0.0, 0.0), (0.06, 0.06), (-0.06, -0.06), (0.06, -0.06), (-0.06, 0.06))
 """Where the five of a layer start [m]."""
 

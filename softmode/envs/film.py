@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,9 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from softmode.envs.cameras import FollowCamera
 from softmode.envs.markers import GREEN
-
-if TYPE_CHECKING:
-    from softmode.envs.task import Task
 
 FINGERS = 0.045
 """Radius about the tool that the following camera shows [m]."""
@@ -29,10 +26,10 @@ class TaskFilm:
     they close. The second one shows the arm, the object and the goal, as near as that allows.
 
     Args:
-        task: The task.
+        task: The task, a `Task`.
     """
 
-    def __init__(self, task: Task) -> None:
+    def __init__(self, task: Any) -> None:
         """Start without a place."""
         near, far = task.render_cameras()
         self._near = FollowCamera(near, task.world_count)
@@ -43,7 +40,7 @@ class TaskFilm:
         self._near.forget(mask)
         self._far.forget(mask)
 
-    def draw(self, task: Task) -> NDArray[np.uint8]:
+    def draw(self, task: Any) -> NDArray[np.uint8]:
         """Return the pictures of the task side by side, uint8 (world_count, edge, 2 * edge, 3)."""
         scene = task.scene
         film, goal = scene.film, scene.marker_place.numpy()[:, :3].astype(float)
@@ -65,7 +62,7 @@ class TaskFilm:
         return np.concatenate(list(pictures.reshape(-1, task.world_count, *pictures.shape[1:])), axis=2)
 
 
-def _points(task: Task) -> NDArray[np.float64]:
+def _points(task: Any) -> NDArray[np.float64]:
     """Return balls (x, y, z, radius) [m] about points of the surface of object 0, shape (world_count, K, 4)."""
     first = task.state.particle_start.numpy()[:: task.state.stride, None]
     return _balls(task.scene.state.particle_q.numpy()[first + task.points_of_worlds].astype(float), POINT)
