@@ -23,7 +23,7 @@ class TaskFilm:
     """Aims the film cameras of a task's scene in every frame.
 
     The first camera shows object 0 and the fingers; where the task asks for it, it looks across the direction in which
-    they close. The second one shows the arm, the object and the goal, as near as that allows.
+    they close. Others show the arm, the object and the goal, as near as that allows.
 
     Args:
         task: The task, a `Task`.
@@ -31,14 +31,14 @@ class TaskFilm:
 
     def __init__(self, task: Any) -> None:
         """Start without a place."""
-        near, far = task.render_cameras()
+        near, *others = task.render_cameras()
         self._near = FollowCamera(near, task.world_count)
-        self._far = FollowCamera(far, task.world_count, room=1.06, seconds=0.5)
+        self._far = [FollowCamera(camera, task.world_count, room=1.06, seconds=0.5) for camera in others]
 
     def forget(self, mask: NDArray[np.bool_]) -> None:
         """Let the cameras jump to their place in the masked worlds, shape (world_count,)."""
-        self._near.forget(mask)
-        self._far.forget(mask)
+        for camera in (self._near, *self._far):
+            camera.forget(mask)
 
     def draw(self, task: Any) -> NDArray[np.uint8]:
         """Return the pictures of the task side by side, uint8 (world_count, edge, 2 * edge, 3)."""
@@ -53,7 +53,8 @@ class TaskFilm:
             if scene.marker is not None:
                 far = np.concatenate([far, _balls(goal[:, None], 0.02)], axis=1)
             film.aim(film.cameras[0].name, self._near.matrices(near, time, closing))
-            film.aim(film.cameras[1].name, self._far.matrices(far, time))
+            for seen, camera in zip(film.cameras[1:], self._far, strict=True):
+                film.aim(seen.name, camera.matrices(far, time))
             if task.goal_ring:
                 scale = task.table.values.numpy()[:, task.table.column("scale")]
                 radius = np.array([thing.radius for thing in scene.members])[scene.member] * scale
