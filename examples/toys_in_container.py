@@ -95,7 +95,8 @@ def test_final(scene: SplatScene, record: Record) -> None:
     """Nothing went wrong, all toys lie in the container, at rest, and nothing was ever deep in a wall or a toy.
 
     In the fall, arms are pressed into others by up to 6 mm: with functions that bend rightly they give way.
-    The status says "penetration" of it. Presets, some a tenth as dense as others, are by up to 11 mm. The bounds below say how much is right.
+    The status says "penetration" of it. Presets, some a tenth as dense as others, are by up to 11 mm. The bounds below
+    say how much is right.
     """
     centres = np.array([scene.surface(i).mean(axis=0) for i in range(len(scene.objects))])
     assert set(record.reasons) <= {"penetration"}

@@ -33,7 +33,7 @@ class TaskFilm:
         """Start without a place."""
         near, *others = task.render_cameras()
         self._near = FollowCamera(near, task.world_count)
-        self._far = [FollowCamera(camera, task.world_count, room=1.06, seconds=0.5) for camera in others]
+        self._far = [FollowCamera(camera, task.world_count, room=1.12, seconds=0.35) for camera in others]
 
     def forget(self, mask: NDArray[np.bool_]) -> None:
         """Let the cameras jump to their place in the masked worlds, shape (world_count,)."""
