@@ -141,13 +141,13 @@ class Stage:
             scale=unit,
         )
         if self._on_drag is not None:
-            self._add_grips(picture)
+            self._add_grips(picture, self._on_drag)
 
     def _surfaces(self) -> Vector:
         """Return the surface samples of all objects [m], shape (S, 3)."""
         return np.concatenate([self._session.surface(k) for k in range(len(self._session.objects))])
 
-    def _add_grips(self, picture: SplatPicture) -> None:
+    def _add_grips(self, picture: SplatPicture, on_drag: Handler) -> None:
         """Cover the object with invisible spheres that receive the mouse.
 
         Splats receive none. A mesh does, but viser's own materials write depth even where they are transparent, which
@@ -165,14 +165,14 @@ class Stage:
         self._grips = self._server.scene.add_batched_glb(
             "/grips", _invisible_sphere(radius), **places, lod="off", cast_shadow=False, receive_shadow=False
         )
-        self._grips.on_drag("left")(self._on_drag)
+        self._grips.on_drag("left")(on_drag)
         if self._clickable:
             self.set_clickable(True)
 
     def set_clickable(self, clickable: bool) -> None:
         """Let clicks on the object through, or not; where they are, the browser outlines what is under the mouse."""
         self._clickable = clickable
-        if clickable:
+        if clickable and self._on_click is not None:
             self._grips.on_click(self._on_click)
         else:
             self._grips.remove_click_callback("all")

@@ -51,7 +51,8 @@ def test_what_a_film_shows(lift: Any) -> None:
     """
     task = lift.unwrapped.task
     scene, film = task.scene, task.scene.film
-    policy, body = scripted_policy(lift), scene.soft.body
+    policy: Any = scripted_policy(lift)
+    body = scene.soft.body
     for seed in range(10):
         observation, _ = lift.reset(seed=seed)
         policy.reset()

@@ -235,7 +235,7 @@ def _light(
     light.above, light.below = (wp.vec3(*radiance) for radiance in options.ambient)
     light.sun = wp.vec3(*options.light_color)
     if look is not None:
-        light.fill_direction = wp.normalize(wp.vec3(*look.fill_direction))
+        light.fill_direction = wp.vec3(*light_frame(look.fill_direction)[2])
         light.fill, light.wall, light.floor = (wp.vec3(*c) for c in (look.fill_color, look.wall, look.floor))
         light.room_low, light.room_high = (wp.vec3(*corner) for corner in look.room)
     light.horizon, light.zenith = (wp.vec3(*color) for color in options.sky)
