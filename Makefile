@@ -74,8 +74,10 @@ resolve: $(VENV)/.created  ## check that all extras resolve to wheels on every s
 	    --no-header --no-annotate pyproject.toml | wc -l | sed 's/$$/ packages/'; \
 	done
 
-demo: $(VENV)/.demo  ## play the scripted lift and write out/lift.mp4
-	$(BIN)/softmode play softmode/LiftSoft-v0 --policy scripted --video out/lift.mp4 $(ARGS)
+# Wool as soft as foam, and as heavy as when it is wet: it gives way between the fingers and swings.
+DEMO := --object glove --youngs-modulus 3e4 --density 400
+demo: $(VENV)/.demo  ## play the scripted lift of a soft glove and write out/lift.mp4
+	$(BIN)/softmode play softmode/LiftSoft-v0 $(DEMO) --video out/lift.mp4 $(ARGS)
 
 # All cores compile an environment's kernels at once, before the processes of a run wait for each other's.
 $(WARP_CACHE_PATH): | $(VENV)/.dev

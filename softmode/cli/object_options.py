@@ -23,7 +23,8 @@ class ObjectOptions:
     """Your own object, and what it is made of. What is left out is as the task, the policy's run or the file has it."""
 
     splat: Path | None = None
-    """Splat file: .ply, .spz, .splat, .sog, a SOG folder or its meta.json, .usd; or a point cloud."""
+    """Splat file: .ply, .spz, .splat, .sog, a SOG folder or its meta.json, .usd; or a point cloud; or playbot, which
+    comes with softmode."""
     object: Path | None = None
     """File of any kind: a mesh, a body of `softmode body build`, splats, a radiance field, an OpenUSD stage; or a
     preset's name, see `softmode objects list`."""

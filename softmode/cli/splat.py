@@ -5,10 +5,10 @@ from __future__ import annotations
 import dataclasses
 import warnings
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from softmode.checks import require_number
-from softmode.cli.common import bar_interval, quiet_warp, warp_device
+from softmode.cli.common import bar_interval, one_place, optional_argument, quiet_warp, short_name, warp_device
 from softmode.errors import AssetError, ConfigError
 from softmode.files import check_place
 from softmode.stages import stage
@@ -23,7 +23,7 @@ class SplatFromMesh:
 
     mesh: Path
     """Mesh file of any kind that trimesh reads (.glb, .obj, .ply, .stl, ...), with its textures."""
-    out: Path | None = None
+    out: Annotated[Path | None, short_name("-o")] = None
     """Splat file to write, of the kind its suffix names; MESH_splats.ply beside the mesh if omitted."""
     count: int = 10_000
     """Number of splats."""
@@ -97,9 +97,10 @@ class SplatInfo:
         """Print count, degree, box, scales and opacities."""
         import numpy as np
 
+        from softmode.objects.captures import bundled
         from softmode.splats.formats import read_splats
 
-        splats = read_splats(self.file)
+        splats = read_splats(bundled(self.file) or self.file)
         low, high = splats.bounds()
         deciles = [0.1, 0.5, 0.9]
 
@@ -128,7 +129,7 @@ class SplatShow:
 
     file: Path
     """The splat file."""
-    out: Path | None = None
+    out: Annotated[Path | None, short_name("-o")] = None
     """Sheet to write (.png); FILE_sheet.png in the working folder if omitted."""
     up: Literal["+x", "-x", "+y", "-y", "+z", "-z"] | None = None
     """Axis of the file that points up; -y if omitted."""
@@ -139,6 +140,7 @@ class SplatShow:
 
     def run(self) -> int:
         """Look, draw, write; return the exit code."""
+        from softmode.objects.captures import bundled
         from softmode.objects.config import ObjectConfig
         from softmode.splats.formats import read_splats
 
@@ -146,7 +148,7 @@ class SplatShow:
         check_place(out, "sheet", make_folders=False)
         up = self.up or "-y"
         with stage(f"reading {self.file.name}"):
-            splats = read_splats(self.file).oriented(up)
+            splats = read_splats(bundled(self.file) or self.file).oriented(up)
         if self.crop is not None:
             splats = splats.cropped(self.crop[:3], self.crop[3:])
         with quiet_warp():
@@ -176,8 +178,10 @@ class SplatConvert:
 
     source: Path
     """File to read."""
-    target: Path
+    target: Annotated[Path | None, optional_argument()] = None
     """File to write: .ply, .compressed.ply, .splat, .spz, .usd, .usda or .usdc."""
+    out: Annotated[Path | None, short_name("-o")] = None
+    """The same file, as an option."""
     convention: Literal["z-up", "spz", "trained"] | None = None
     """Whom the written file is turned for: softmode (z-up); readers that keep to SPZ's specification, and three.js
     (spz: y up); those that take a file as training leaves it (trained: y down). Without it the numbers stay."""
@@ -191,7 +195,8 @@ class SplatConvert:
         from softmode.foreign import tokens
         from softmode.splats.formats import CONVENTIONS, read_splats, write_splats
 
-        check_splat_target(self.target)
+        target = one_place(self.target, self.out)
+        check_splat_target(target)
         if self.convention is None and self.up is not None:
             raise ConfigError("--up says nothing without a convention", hint="give --convention too, like spz")
         with warnings.catch_warnings():
@@ -203,13 +208,13 @@ class SplatConvert:
             )
             raise AssetError(problem, hint=f"add --drop-invalid to leave them out and keep {splats.count}")
         if self.convention is None:
-            write_splats(self.target, splats)
+            write_splats(target, splats)
         else:
             own = "+z" if self.source.suffix.lower() in tokens.SUFFIXES else "-y"
-            write_splats(self.target, splats.oriented(self.up or own), up=CONVENTIONS[self.convention])
+            write_splats(target, splats.oriented(self.up or own), up=CONVENTIONS[self.convention])
         for note in splats.notes:
             print(f"note: {note}")
-        print(f"wrote {splats.count} splats of degree {splats.sh_degree} to {self.target}")
+        print(f"wrote {splats.count} splats of degree {splats.sh_degree} to {target}")
         return 0
 
 

@@ -9,7 +9,15 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from softmode.checks import require_number
-from softmode.cli.common import own_group, quiet_warp, same_fields, warn_of_env
+from softmode.cli.common import (
+    one_place,
+    optional_argument,
+    own_group,
+    quiet_warp,
+    same_fields,
+    short_name,
+    warn_of_env,
+)
 from softmode.cli.object_options import ObjectOptions
 from softmode.cli.robot_options import RobotOptions
 from softmode.envs.catalogue import is_soft
@@ -35,6 +43,8 @@ class Train(RunOptions):
     """Further keyword arguments of the environment as JSON."""
     total_steps: float | None = None
     """Environment steps of all worlds together after which training ends; 1e7 if no limit is given."""
+    run_dir: Annotated[Path | None, short_name("-o")] = None
+    """Folder of the run, not there yet; runs/<Env>/<time>[_name] if omitted."""
     set: tuple[str, ...] = ()
     """Hyperparameters other than the preset's, as NAME=VALUE, for example discount=0.97 hidden=[64,64]."""
     arm: Annotated[RobotOptions, own_group()] = dataclasses.field(default_factory=RobotOptions)
@@ -141,8 +151,10 @@ class Export:
 
     checkpoint: Path
     """Checkpoint of a run, for example best.npz."""
-    out: Path
+    file: Annotated[Path | None, optional_argument()] = None
     """File to write (.npz), not there yet; play, evaluate, --init and --teacher read it."""
+    out: Annotated[Path | None, short_name("-o")] = None
+    """The same file, as an option."""
 
     def run(self) -> int:
         """Write the file; return the exit code."""
@@ -150,11 +162,12 @@ class Export:
         from softmode.learning.checkpoints import policy_only, read_checkpoint, write_checkpoint
         from softmode.learning.policy import load_policy
 
-        if self.out.exists():
-            raise ConfigError(f"{self.out} exists", hint="remove it, or write another file")
+        out = one_place(self.file, self.out)
+        if out.exists():
+            raise ConfigError(f"{out} exists", hint="remove it, or write another file")
         load_policy(self.checkpoint)  # refuses a file whose actor does not fit its header
-        write_checkpoint(policy_only(read_checkpoint(self.checkpoint)), self.out)
-        print(f"{self.out}: {self.out.stat().st_size / 1e3:.0f} kB")
+        write_checkpoint(policy_only(read_checkpoint(self.checkpoint)), out)
+        print(f"{out}: {out.stat().st_size / 1e3:.0f} kB")
         return 0
 
 

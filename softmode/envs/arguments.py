@@ -23,6 +23,8 @@ from softmode.objects.config import ObjectConfig
 
 CONTROL_MODES = ("pose_delta", "joint_delta")
 RENDER_MODES = ("rgb_array",)
+LOOK_ON = "human"
+"""Render mode of a single environment that opens a page in the browser."""
 
 TaskT = TypeVar("TaskT", bound=Task)
 
@@ -50,7 +52,7 @@ class Shortcuts:
     obs_type: ObservationType = "state"
     """Kind of observation."""
     render_mode: str | None = None
-    """"rgb_array" or None."""
+    """"rgb_array", "human" or None."""
     control_mode: str | None = None
     """What actions mean; None keeps the configuration's."""
     splat: str | Path | None = None
@@ -69,6 +71,8 @@ def checked_config(
     given: Shortcuts,
     any_robot: bool = True,
     values: Mapping[str, Any] | None = None,
+    *,
+    single: bool = False,
 ) -> TaskConfig:
     """Return the configuration with the constructor's fields and shortcuts applied.
 
@@ -78,12 +82,13 @@ def checked_config(
         given: The shortcuts.
         any_robot: Whether the task plays with robots from files.
         values: Fields of the configuration, which replace those that it has.
+        single: Whether it is for an environment of one world, which people may look on.
 
     Raises:
         ConfigError: If an option or a field is unknown, or the configuration of another task.
     """
     require_choice("obs_type", given.obs_type, get_args(ObservationType))
-    require_choice("render_mode", given.render_mode, (*RENDER_MODES, None))
+    require_choice("render_mode", given.render_mode, (*RENDER_MODES, *([LOOK_ON] if single else []), None))
     require_choice("control_mode", given.control_mode, (*CONTROL_MODES, None))
     if config is not None and not isinstance(config, wanted):
         hint = f"pass {wanted.__name__}(image_size=128), of {wanted.__module__}"

@@ -200,7 +200,7 @@ def set_worlds_state(
         _write(array, count, values[name])
     task.scene.observe()
     task.write_observation()
-    task.pictures.forget_film(mask)
+    task.film.forget(mask)
     for name in ("task.observation", "task.metrics"):
         _write(*chosen[name], values[name])
     task.pictures.draw()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import importlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Self
@@ -14,7 +15,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from softmode.deformables.model.status import status_reasons
 from softmode.deformables.reduction.build_body import Progress
+from softmode.deformables.tools.gaps import warn_of_overlaps
 from softmode.envs.arguments import (
+    LOOK_ON,
+    RENDER_MODES,
     Shortcuts,
     TaskEnv,
     TaskT,
@@ -31,7 +35,7 @@ from softmode.envs.reward_kernels import EndReason
 from softmode.envs.robots import Robot
 from softmode.envs.task_config import ObservationType, TaskConfig
 from softmode.envs.worlds import LocalWorlds
-from softmode.errors import ConfigError
+from softmode.errors import ConfigError, needs_extra
 
 
 class SoftEnv(TaskEnv[TaskT], gym.Env, gym.utils.EzPickle):
@@ -68,7 +72,8 @@ class SoftEnv(TaskEnv[TaskT], gym.Env, gym.utils.EzPickle):
 
     Args:
         obs_type: What ``reset`` and ``step`` return.
-        render_mode: "rgb_array" or None.
+        render_mode: "rgb_array"; "human" for a page in the browser that shows every step, with the extra `[viz]`; or
+            None.
         control_mode: What actions mean.
         splat: Splat file of the object; None for the built-in one.
         size: Longest edge of the object [m].
@@ -85,6 +90,7 @@ class SoftEnv(TaskEnv[TaskT], gym.Env, gym.utils.EzPickle):
         AssetError: If the splat file cannot be used.
     """
 
+    metadata = {"render_modes": [*RENDER_MODES, LOOK_ON], "render_fps": 30}  # noqa: RUF012  (gymnasium's own convention)
     task: TaskT
     """The task in one world."""
 
@@ -116,7 +122,12 @@ class SoftEnv(TaskEnv[TaskT], gym.Env, gym.utils.EzPickle):
         # What a copy is made from when the environment is pickled; a callback cannot travel.
         place = None if device is None else str(device)
         gym.utils.EzPickle.__init__(self, **vars(given), config=config, device=place, **fields)
-        self.config = checked_config(self.task_class.config_class, config, given, self.task_class.any_robot, fields)
+        self.config = checked_config(
+            self.task_class.config_class, config, given, self.task_class.any_robot, fields, single=True
+        )
+        if render_mode == LOOK_ON:
+            with needs_extra("viz", 'render_mode="human" needs viser'):
+                import viser  # noqa: F401
         self.obs_type, self.render_mode = obs_type, render_mode
         self.metadata = {**self.metadata, "render_fps": round(self.config.scene.control_hz)}
         made = {"config": self.config, "obs_type": obs_type, "render": render_mode is not None}
@@ -128,10 +139,11 @@ class SoftEnv(TaskEnv[TaskT], gym.Env, gym.utils.EzPickle):
         """What the last reset or step made: always the same memory."""
         self._begun = False
         """Whether an episode has begun."""
+        self._page: Any = None
         self._object_names = () if self.config.object_set is None else self.config.object_set.names
 
     def reset(self, *, seed: int | None = None, options: Mapping[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Start an episode."""
+        """Start an episode; what starts more than 1 mm inside something else is said in the log "softmode"."""
         given = checked_options(options)
         self._begun = True
         if "state" in given:
@@ -140,12 +152,15 @@ class SoftEnv(TaskEnv[TaskT], gym.Env, gym.utils.EzPickle):
                     "a state excludes a seed and other options, it brings its own", hint="give the state alone"
                 )
             self._set_state(checked_state(given["state"]), begin=True)
+            self._look_on()
             return self._observe(), self._info()
         given = check_options(self.task.table.options, given, 1)
         fresh = seed is not None or self._np_random is None
         super().reset(seed=seed)
         seed = world_seed(self.np_random) if fresh else -1
         self._worlds.reset(np.ones(1, bool), np.array([seed]), given)
+        warn_of_overlaps(self.scene.solver, self.scene.state, self.scene.dt)
+        self._look_on()
         return self._observe(), self._info()
 
     def step(self, action: ArrayLike) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -157,6 +172,7 @@ class SoftEnv(TaskEnv[TaskT], gym.Env, gym.utils.EzPickle):
         if not self._begun:
             raise ConfigError("step comes before the first reset", hint="call reset() first")
         self._worlds.step(checked_actions(action, self.action_space)[None])
+        self._look_on()
         info, made = self._info(), self._result
         reward, terminated, truncated = (take(made[n], 0, scalars=True) for n in ("reward", "terminated", "truncated"))
         if terminated:
@@ -212,9 +228,27 @@ class SoftEnv(TaskEnv[TaskT], gym.Env, gym.utils.EzPickle):
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return the views of the rendering cameras side by side, uint8 (render_size, 2 render_size, 3)."""
-        if self.render_mode is None:
+        if self.render_mode != "rgb_array":
             return None
         return self._worlds.render()[0]
+
+    @property
+    def page_url(self) -> str | None:
+        """Where the page of ``render_mode="human"`` is, from the first reset on; None in other modes."""
+        return None if self._page is None else self._page.url
+
+    def close(self) -> None:
+        """End the page, if there is one."""
+        if self._page is not None:
+            self._page.close()
+            self._page = None
+
+    def _look_on(self) -> None:
+        """Show the present state to who looks on."""
+        if self.render_mode == LOOK_ON:
+            if self._page is None:  # loaded by name: a room above this one
+                self._page = importlib.import_module("softmode.view.env_page").EnvPage(self)
+            self._page.show()
 
     def _observe(self) -> Any:
         """Return the observation in arrays of its own."""

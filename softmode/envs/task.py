@@ -21,6 +21,7 @@ from softmode.deformables.reduction.build_body import Progress
 from softmode.envs import task_kernels as kernels
 from softmode.envs.cameras import overview, square_camera, wrist_camera
 from softmode.envs.episodes import FALL, Episodes
+from softmode.envs.film import TaskFilm
 from softmode.envs.observation import (
     ObservationTable,
     Segment,
@@ -42,6 +43,7 @@ from softmode.scenes.occupancy import Occupancy
 from softmode.scenes.table_scene import Marker, TableScene, TableSceneConfig
 from softmode.splats.cameras.camera import CameraOptions
 from softmode.splats.raster.pinhole import PinholeCamera
+from softmode.stages import stage
 
 
 class Task:
@@ -69,7 +71,8 @@ class Task:
         segments: Columns of each of them by name.
         episodes: How far each episode is, what it earns, how it ends.
         placement: Puts objects down.
-        pictures: What cameras draw.
+        pictures: What the cameras of an observation draw.
+        film: What people watch.
         observation: Bounded observation vector, float32, shape (world_count, D).
         terms: Reward terms, shape (world_count, T), `term_names`.
         metrics: Task-specific figures, shape (world_count, M), `metric_names`.
@@ -105,6 +108,10 @@ class Task:
     takes_several: ClassVar[bool] = False
     """Whether worlds may have several objects of the set (`ObjectSet.per_world`): object 0 is that of the task, the
     others lie beside it, see `other_arcs`."""
+    filmed_across: ClassVar[bool] = False
+    """Whether the film's first camera looks across the direction in which the fingers close."""
+    goal_ring: ClassVar[bool] = False
+    """Whether films show the goal as a ring about where the object is to be, in place of the marker."""
     any_robot: ClassVar[bool] = False
     """Whether the task has been tried with robots from files, which `robot` names."""
     step_kernels: ClassVar[tuple[Any, Any] | None] = None
@@ -135,7 +142,7 @@ class Task:
         _check_set(type(self), config)
         cameras = [self.observation_camera()] if obs_type != "state" else []
         film = self.render_cameras() if render else []  # for recorders, in fixed places
-        with compiling_aside(device):
+        with stage("making the environment"), compiling_aside(device):
             self.scene = scene = TableScene(
                 self.scene_config(),
                 world_count=world_count,
@@ -203,8 +210,8 @@ class Task:
             self.placement = Placement(scene, self.table, self.state)
             edge = config.image_size if cameras else None
             keep_last = autoreset_mode == AutoresetMode.SAME_STEP
-            follow = self.render_cameras()[0]
-            self.pictures = Pictures(scene, edge, config.image_outputs, follow, keep_last=keep_last)
+            self.pictures = Pictures(scene, edge, config.image_outputs, keep_last=keep_last)
+            self.film = TaskFilm(self)
             self.build()
             self.plan = None if self.step_kernels is None else plan_of(self, self.step_kernels[0])
             for launches in (self.before_step, partial(self.judge, self.episodes.never), self.clear):

@@ -289,8 +289,7 @@ def spaces_of(task: Task) -> tuple[gym.spaces.Box, gym.Space]:
 
 def film_of(task: Task) -> NDArray[np.uint8]:
     """Return a frame per world: the pictures of the film cameras side by side."""
-    scale: NDArray[Any] = task.table.values.numpy()[:, task.table.column("scale")]
-    return task.pictures.draw_film(scale, task.episodes.elapsed.numpy() / task.config.scene.control_hz)
+    return task.film.draw(task)
 
 
 def info_arrays(task: Task, *, final: bool = False) -> dict[str, Tree]:

@@ -13,6 +13,7 @@ from softmode.deformables.materials.material import Material
 from softmode.deformables.quadrature.surface_samples import SURFACE_COUNT
 from softmode.deformables.reduction.options import BuildOptions
 from softmode.errors import AssetError, ConfigError
+from softmode.objects.captures import bundled
 from softmode.objects.fingerprint import file_fingerprint, find_file
 from softmode.objects.paint import StifferColor
 from softmode.objects.parts import Part, Rule
@@ -68,7 +69,7 @@ class ObjectConfig:
     """Name of an object of the library, `PRESETS`: "sponge", "mug", ...; `load` gives it the preset's material."""
     splat: str | Path | Splats | None = None
     """Splat file (.ply, SOG v2, .spz, .splat, OpenUSD), or a point cloud (.npz, see `read_points`, or .ply); or splats
-    that have been read."""
+    that have been read; or the name of a bundled capture, "playbot"."""
     mesh: str | Path | ColoredMesh | None = None
     """Mesh file (.obj, .glb, .stl, ... whatever trimesh reads, OpenUSD), or a mesh that has been read. One that is not
     closed stands for what it encloses."""
@@ -133,6 +134,8 @@ class ObjectConfig:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
+        if isinstance(self.splat, str | Path):
+            object.__setattr__(self, "splat", bundled(self.splat) or self.splat)
         object.__setattr__(self, "stiffness", tuple(self.stiffness))
         object.__setattr__(self, "stiffness_colors", tuple(self.stiffness_colors))
         object.__setattr__(self, "density_colors", tuple(self.density_colors))

@@ -17,6 +17,7 @@ from softmode.deformables.body.regions import Region
 from softmode.deformables.materials.material import Material, warn_of_units
 from softmode.deformables.quadrature.quadrature_grid import Quadrature
 from softmode.deformables.reduction.cache import cached_body
+from softmode.objects.captures import bundled
 from softmode.objects.config import ObjectConfig
 from softmode.objects.object_file import file_kind, read_object, surface_cover
 from softmode.objects.pipeline import body_key, build_standing, dressed
@@ -26,6 +27,7 @@ from softmode.objects.source import ObjectSource, object_source
 from softmode.radiance.grid import RadianceGrid
 from softmode.splats.colored_mesh import ColoredMesh
 from softmode.splats.splats import Splats
+from softmode.stages import stage
 
 if TYPE_CHECKING:
     import trimesh
@@ -48,9 +50,9 @@ def load(
     """Return a soft object: read or make its splats, build or recall its body.
 
     Args:
-        source: A configuration; the name of a preset, such as "mug"; a file of splats, of a point cloud, of a mesh, of
-            a radiance field or of a body, or an OpenUSD stage with any of these but a field; a body; splats, a field or
-            a mesh (also of trimesh) in memory; None for the built-in plush.
+        source: A configuration; the name of a preset, such as "mug", or of the capture "playbot"; a file of splats, of
+            a point cloud, of a mesh, of a radiance field or of a body, or an OpenUSD stage with any of these but a
+            field; a body; splats, a field or a mesh (also of trimesh) in memory; None for the built-in plush.
         material: What it is made of; None for what its file or preset says. The body is built for its Poisson's ratio,
             unless `BuildOptions` name one.
         progress: Passed to :func:`softmode.deformables.reduction.build_body.build_body`.
@@ -121,7 +123,9 @@ def build_object(
 
 def _read(config: ObjectConfig, material: Material | None) -> tuple[ObjectSource, Material | None, ObjectConfig]:
     """Return what an object is made of, its material, and the configuration of a body for that."""
-    parts, material = object_source(config), material or config.material
+    with stage(f"reading {config.preset or (config.kind if config.file is None else config.file[1].name)}"):
+        parts = object_source(config)
+    material = material or config.material
     return parts, material, config.for_material(material)
 
 
@@ -144,6 +148,8 @@ def object_config(source: Source | str | os.PathLike[str] | None, **options: Any
     if isinstance(source, str | os.PathLike):
         if os.fspath(source) in PRESETS:
             return ObjectConfig(preset=os.fspath(source), **options)
+        if bundled(source):
+            return ObjectConfig(splat=source, **options)
         kind = file_kind(source)
         return ObjectConfig(**{"splat" if kind == "points" else kind: Path(source)}, **options)
     for known, kind in _IN_MEMORY.items():

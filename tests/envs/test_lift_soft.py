@@ -211,7 +211,7 @@ def test_large_actions_are_clamped(lift: LiftSoftEnv) -> None:
     "given",
     [
         {"obs_type": "depth"},
-        {"render_mode": "human"},
+        {"render_mode": "ansi"},
         {"control_mode": "torque"},
         {"size": 0.0},
         {"config": {"image_size": 128}},

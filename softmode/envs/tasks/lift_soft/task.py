@@ -82,6 +82,7 @@ class LiftSoft(Task):
     config_class = LiftSoftConfig
     step_kernels = (kernels.observe, kernels.evaluate)
     grasps = True
+    filmed_across = goal_ring = True
     takes_sets = True
     takes_several = True
     any_robot = True
