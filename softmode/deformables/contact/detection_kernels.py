@@ -10,16 +10,27 @@ contact records are appended by an atomic counter: fixed slots per sample keep t
 
 import warp as wp
 
+from softmode.deformables.contact.cell_kernels import (
+    Surface,
+    cell_at,
+    gradient_of,
+    shape_curvature,
+    shape_of_cell,
+    spared_share,
+    write_row,
+)
 from softmode.deformables.contact.penalty_kernels import (
     BULK_FACTOR,
     SHEAR_FACTOR,
     dent_compliance,
     dent_depth,
+    shear_yield,
     stiffness_per_area,
 )
 from softmode.deformables.contact.shape_query_kernels import (
     HEIGHTFIELD,
     PLANE,
+    SMOOTH,
     Heightfields,
     SurfaceQuery,
     query_heightfield,
@@ -380,6 +391,23 @@ def shape_area(shapes: Shapes, shape: int):
 
 
 @wp.func
+def curvature_of(shapes: Shapes, shape: int, normal: wp.vec3d):
+    """Return the mean curvature [1/m] of a shape where its normal is ``normal``."""
+    _origin, rotation = shape_frame(shapes, shape)
+    axis = wp.quat_rotate(rotation, wp.vec3d(wp.float64(0.0), wp.float64(0.0), wp.float64(1.0)))
+    return shape_curvature(shapes.kind[shape], shapes.scale[shape], float(wp.dot(axis, normal)))
+
+
+@wp.func
+def shape_drift(shapes: Shapes, shape: int, x: wp.vec3, dt: float):
+    """Return how far a point of a shape moves in a step at its velocity [m]."""
+    body = shapes.body[shape]
+    if body < 0:
+        return wp.vec3()
+    return dt * point_velocity(shapes.body_q[body], shapes.body_qd[body], shapes.body_com[body], x)
+
+
+@wp.func
 def shape_frame(shapes: Shapes, shape: int):
     """Return origin and rotation of a shape at the start of the step, in float64."""
     pose = shapes.transform[shape]
@@ -462,8 +490,8 @@ def gather_contacts(
     basis: Basis,
     shapes: Shapes,
     samples: Samples,
-    relative_stiffness: wp.array[float],  # (sample_total,), Young's modulus relative to the body's
-    dent_length: wp.array[float],  # (sample_total,), see ``dents`` [m]
+    motion: Motion,
+    surface: Surface,
     constraint_max: int,
     prescribed: int,
     stick_ratio: wp.float64,
@@ -523,9 +551,18 @@ def gather_contacts(
         gap = wp.max(samples.gap[i, s, slot], deepest)
         # of unit length in float64: what is left of the gap in the slip must not count against the stick range
         normal = wp.normalize(wp.vec3d(samples.normal[i, s, slot]))
-        # both bodies feel the force at the sample, not the shape at its own surface: a pair of forces on two
+        # the cell and its centre of pressure where the body would be without forces: how far a ball rolls in a step
+        # is what turns it
+        cell_shape = shape_of_cell(surface, instances, basis, i, row, curvature_of(shapes, shape, normal))
+        start = gradient_of(instances, basis, motion.q_start, i, row)
+        ahead = gradient_of(instances, basis, motion.q_inertial, i, row)
+        approach = wp.vec3d(samples.drift[i, s] - shape_drift(shapes, shape, wp.vec3(samples.position[i, s]), dt))
+        cell = cell_at(cell_shape, ahead, normal, gap + wp.dot(normal, approach))
+        spared = float(spared_share(surface, samples.shape, samples.gap, cell_shape, cell.fade, i, row, shape))
+        turned = wp.dot(normal, (ahead - start) * cell.centre)
+        # both bodies feel the force at one point, not the shape at its own surface: a pair of forces on two
         # points would make angular momentum out of friction times penetration
-        point = wp.vec3(samples.position[i, s])
+        point = wp.vec3(samples.position[i, s] + start * cell.centre)
         drift = wp.vec3()
         arm = wp.vec3()
         body = shapes.body[shape]
@@ -543,13 +580,15 @@ def gather_contacts(
         partner_mass = float(0.0)
         if body >= 0 and prescribed == 0:
             partner_mass = shapes.body_mass[body]
-        relative = relative_stiffness[row]
+        relative = surface.relative_stiffness[row]
         partner_area = shape_area(shapes, shape)
-        kappa = stiffness_per_area(instances, i, BULK_FACTOR, relative, partner_mass, partner_area, dt)
+        firm = relative * surface.slenderness[row]
+        kappa = stiffness_per_area(instances, i, BULK_FACTOR, firm, partner_mass, partner_area, dt)
         shear = stiffness_per_area(instances, i, SHEAR_FACTOR, relative, partner_mass, partner_area, dt)
         area = wp.max(sample_area(instances.scale[i], basis.row_area[row]), 1.0e-30)
         stiffness = wp.float64(kappa * area)
-        compliance = dent_compliance(instances, i, relative, dent_length[row]) / area
+        compliance = wp.float64(spared * dent_compliance(instances, i, relative, surface.dent_length[row]) / area)
+        edged = (SMOOTH >> shapes.kind[shape]) & 1 == 0
         slip, anchor = remembered_slip(
             shapes,
             shape,
@@ -561,12 +600,20 @@ def gather_contacts(
             prescribed,
         )
         # d enters as offset + displacement, with the gap along the normal and the shape's own motion taken off
-        constraints.offset[i, e] = gap * normal + slip - wp.vec3d(drift)
+        begin_at = gap - turned + wp.float64(0.5) * (cell_shape.bend - cell.onset)
+        constraints.offset[i, e] = begin_at * normal + slip - wp.vec3d(drift)
+        constraints.onset[i, e] = cell.onset
         constraints.anchor[i, e] = anchor
-        constraints.stick[i, e] = stick_ratio * wp.float64(shear * area)
+        stick = stick_ratio * wp.float64(shear * area)
+        constraints.stick[i, e] = stick / (wp.float64(1.0) + stick * shear_yield(instances, i, compliance))
         constraints.stiffness[i, e] = stiffness
-        constraints.dent_compliance[i, e] = wp.float64(compliance)
-        constraints.dent_depth[i, e] = wp.float64(dent_depth(instances, i, dent_length[row]))
+        constraints.dent_compliance[i, e] = compliance
+        depth = dent_depth(instances, i, surface.dent_length[row], edged)
+        constraints.dent_depth[i, e] = wp.float64(spared * depth)
+        constraints.partner_row[i, e] = row
+        if wp.length_sq(cell.centre) > wp.float64(0.0):
+            constraints.row[i, e] = surface.first_row + i * surface.row_max + e
+            write_row(basis, constraints.row[i, e], row, cell.centre)
         constraints.friction[i, e] = wp.float64(wp.sqrt(instances.friction[i] * shapes.friction[shape]))
 
 

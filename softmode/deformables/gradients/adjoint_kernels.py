@@ -12,7 +12,6 @@ from softmode.deformables.contact.penalty_kernels import (
     SHEAR_FACTOR,
     contact_potential,
     dent_exponents,
-    dented_penalty,
     friction_potential,
     slip_potential,
     stiffness_exponents,

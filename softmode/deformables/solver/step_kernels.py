@@ -432,7 +432,6 @@ def evaluate_constraint(
     if not known:
         count = step.instances.function_count[i]
         d = interpolate_change(step.basis.row, row, q, step.motion.q_start, i, count, lane, lanes)
-    smoothing = step.instances.smoothing[i]
     share = wp.float64(1.0)
     if e >= step.constraints.count[i] - step.constraints.pair_count[i]:
         j = step.constraints.partner[i, e]
@@ -441,7 +440,6 @@ def evaluate_constraint(
                 row = step.constraints.partner_row[i, e]
                 count = step.instances.function_count[j]
                 d -= interpolate_change(step.basis.row, row, q, step.motion.q_start, j, count, lane, lanes)
-            smoothing = wp.min(smoothing, step.instances.smoothing[j])
             share = wp.float64(0.5)
     if lane != 0:
         return
@@ -459,14 +457,14 @@ def evaluate_constraint(
     else:
         n = step.constraints.normal[i, e]
         total = step.constraints.offset[i, e] + d
-        psi, slope, curvature = contact_potential(step.constraints, smoothing, -wp.dot(n, total), i, e)
+        psi, slope, curvature = contact_potential(step.constraints, -wp.dot(n, total), i, e)
         if derivatives != 0 and step.state.iteration[w] <= step.state.friction_lag:
             held = slope
             if step.state.iteration[w] == 0:
                 # in an impact the first guess lies far too deep: friction of such a force would be too stiff to solve
                 gap = wp.min(wp.dot(n, step.constraints.offset[i, e]), wp.float64(0.0))
-                deep = wp.float64(smoothing) - wp.float64(2.0) * gap
-                _psi, most, _curvature = contact_potential(step.constraints, smoothing, deep, i, e)
+                deep = step.constraints.onset[i, e] - wp.float64(2.0) * gap
+                _psi, most, _curvature = contact_potential(step.constraints, deep, i, e)
                 held = wp.min(slope, most)
             pressed = stiffness * held
             if step.state.iteration[w] > RELAXED_AFTER:

@@ -1,0 +1,185 @@
+"""Device code of the cells that contact samples stand for: which part of a cell touches, and how much around it does.
+
+A sample stands for a cell of the surface, of the area A at rest. Its contact is the mean of springs over the gaps of
+that cell, which tilt and curvature spread evenly over a range e, the *onset* (see ``penalty_kernels``). With the normal
+n of what is touched, the rest normal N and F of the body where it would be at the end of the step,
+
+    m = P_N F^T n                               slope of the gap over the cell
+    t = |m| L,  L = sqrt(3 A / pi)              range by tilt: that of a strip with the variance of a disc of area A
+    b = A (H + H_other) / (2 pi)                range by the mean curvatures of both: exact for a sphere
+    e = sqrt(e_0^2 + t^2 + b^2)                 e_0: ``contact_smoothing``
+    T = -min(L/2 - q L/(3 t), L t/(6 q)) m/|m|  centre of pressure from the sample, at rest, q = e/2 - gap - b/2 in the
+                                                onset; -L t/(12 (q - e/2)) m/|m| beyond
+
+The row of the contact is that of the sample plus T . grad: force and friction act at the centre of pressure. The dent
+of the sample is as much less as its neighbourhood touches the same thing: the functions carry what is wide.
+"""
+
+import newton
+import warp as wp
+
+from softmode.deformables.model.declare import struct
+from softmode.deformables.model.deformation_kernels import displacement_gradient
+from softmode.deformables.model.lane_kernels import vec8d
+from softmode.deformables.model.struct_kernels import SLOTS, Basis, Instances
+
+wp.set_module_options({"enable_backward": False})
+
+SPHERE, CAPSULE, CYLINDER = (
+    wp.constant(int(kind))
+    for kind in (newton.GeoType.SPHERE, newton.GeoType.CAPSULE, newton.GeoType.CYLINDER)
+)
+PI = wp.constant(wp.float64(3.14159265358979))
+FADE = wp.constant(1.0e-3)
+"""Gap over the size of the body, besides its cell's range, over which a neighbour counts as touching less and less:
+long against a dent, or a face that rides in its onset is soft and stiff in turns."""
+FACING = wp.constant(wp.float64(0.2))
+"""Cosine below which a cell belongs to a face around an edge, whose tilt says nothing of the gaps."""
+LEVEL = wp.constant(wp.float64(1.0e-3))
+"""Range by tilt over e_0 below which a cell is level."""
+
+
+@struct
+class Surface:
+    """What contact knows of the surface samples of all bodies, (sample_total,) where not said."""
+
+    relative_stiffness: wp.array[float]  # Young's modulus relative to the body's
+    dent_length: wp.array[float]  # dent at scale 1 under the pressure E / (1 - nu^2), see ``dents`` [m]
+    slenderness: wp.array[float]  # size of the body over the smaller of it and three thicknesses
+    curvature: wp.array[float]  # mean curvature of the asset at rest [1/m]
+    start: wp.array[int]  # (sample_total + 1,), where each sample's neighbourhood begins in
+    neighbour: wp.array[int]  # samples, counted within their body, and
+    weight: wp.array[float]  # their weights, of sum one
+    first_row: int  # of the rows at centres of pressure
+    row_max: int  # such rows of an instance
+
+
+@struct
+class Cell:
+    """The cell of a sample in a contact."""
+
+    onset: wp.float64  # range of its gaps [m]
+    fade: wp.float64  # range of the gap over which a neighbour counts as touching less and less [m]
+    centre: wp.vec3d  # centre of pressure from the sample, at rest [m]
+
+
+@struct
+class CellShape:
+    """What a cell is, whatever its body does."""
+
+    normal: wp.vec3d  # at rest, outward
+    width: wp.float64  # L [m]
+    bend: wp.float64  # b [m]
+    least: wp.float64  # e_0 [m]
+    steepest: wp.float64  # bound of t: twice the margin within which contacts are found [m]
+    fade: wp.float64  # that of a level and flat cell [m]
+
+
+@wp.func
+def shape_of_cell(surface: Surface, instances: Instances, basis: Basis, i: int, row: int, other: float):
+    """Return what the cell of a sample is against something of a mean curvature [1/m]."""
+    shape = CellShape()
+    s = instances.scale[i]
+    area = wp.float64(basis.row_area[row])
+    shape.normal = wp.vec3d(basis.row_normal[row])
+    shape.width = wp.sqrt(wp.float64(3.0) / PI * area)
+    bend = wp.float64(s * s) * area * wp.float64(surface.curvature[row] / s + other) / (wp.float64(2.0) * PI)
+    shape.bend = wp.max(bend, wp.float64(0.0))
+    shape.least = wp.float64(instances.smoothing[i] / surface.slenderness[row])
+    shape.steepest = wp.float64(2.0 * instances.margin[i])
+    shape.fade = wp.float64(FADE * instances.size[i])
+    return shape
+
+
+@wp.func
+def cell_at(shape: CellShape, F: wp.mat33d, n: wp.vec3d, gap: wp.float64):
+    """Return a cell where its body has the gradient F and its sample a gap [m]; n is the normal of what it touches."""
+    half = wp.float64(0.5)
+    zero = wp.float64(0.0)
+    pull = wp.transpose(F) * n
+    facing = -wp.dot(pull, shape.normal)
+    along = pull + facing * shape.normal
+    slope = wp.length(along)
+    tilt = zero
+    if facing > FACING * wp.length(pull):
+        tilt = slope * shape.width
+        share = tilt / shape.steepest
+        tilt = tilt / wp.sqrt(wp.sqrt(wp.float64(1.0) + share * share * share * share))
+    ranges = tilt * tilt + shape.bend * shape.bend
+    cell = Cell()
+    cell.onset = wp.sqrt(shape.least * shape.least + ranges)
+    cell.fade = shape.fade + wp.sqrt(ranges)
+    if tilt > LEVEL * shape.least:
+        p = -(gap + half * shape.bend)
+        q = p + half * cell.onset
+        at = half * shape.width
+        if q > cell.onset:
+            at = shape.width * tilt / (wp.float64(12.0) * p)
+        elif q > zero:
+            if q < tilt:
+                at -= q * shape.width / (wp.float64(3.0) * tilt)
+            at = wp.min(at, shape.width * tilt / (wp.float64(6.0) * q))
+        cell.centre = -at / slope * along
+    return cell
+
+
+@wp.func
+def gradient_of(instances: Instances, basis: Basis, q: wp.array2d[vec8d], i: int, row: int):
+    """Return the deformation gradient F of an instance at a surface sample."""
+    G = displacement_gradient(basis.row_gradient, q, i, row, instances.function_count[i])
+    return wp.identity(n=3, dtype=wp.float64) + G
+
+
+@wp.func
+def touching(x: wp.float64):
+    """Return how much a neighbour counts as touching, from none at 0 to all at 1."""
+    y = wp.min(wp.max(x, wp.float64(0.0)), wp.float64(1.0))
+    return y * y * (wp.float64(3.0) - wp.float64(2.0) * y)
+
+
+@wp.func
+def neighbour_at(shape: CellShape, fade: wp.float64, gap: wp.float64):
+    """Return where a neighbour with a gap [m] stands between not touching, 0, and touching, 1."""
+    half = wp.float64(0.5)
+    return wp.float64(1.0) - (gap + half * (shape.bend - shape.least)) / fade
+
+
+@wp.func
+def spared_share(
+    surface: Surface,
+    found: wp.array3d[int],  # (instance_count, sample_max, SLOTS), what is touched
+    gap: wp.array3d[wp.float64],  # likewise [m]
+    shape: CellShape,
+    fade: wp.float64,
+    i: int,
+    row: int,
+    other: int,
+):
+    """Return the share of a sample's neighbourhood that does not touch the same thing at the start of the step."""
+    spared = wp.float64(1.0)
+    for k in range(surface.start[row], surface.start[row + 1]):
+        t = surface.neighbour[k]
+        for slot in range(SLOTS):
+            if found[i, t, slot] == other:
+                spared -= wp.float64(surface.weight[k]) * touching(neighbour_at(shape, fade, gap[i, t, slot]))
+    return wp.max(spared, wp.float64(0.0))
+
+
+@wp.func
+def shape_curvature(kind: int, size: wp.vec3, across: float):
+    """Return the mean curvature [1/m] of a rigid shape; ``across``: cosine between its axis and the normal."""
+    if kind == SPHERE:
+        return 1.0 / size[0]
+    if kind == CAPSULE or kind == CYLINDER:
+        return 0.5 * (1.0 - across * across) / size[0]
+    return float(0.0)
+
+
+@wp.func
+def write_row(basis: Basis, row: int, sample: int, X: wp.vec3d):
+    """Write the row at a place beside a sample [m]."""
+    basis.row_point[row] = basis.row_point[sample] + X
+    x = wp.vec3(X)
+    for b in range(basis.row.shape[1]):
+        value = basis.row[sample, b] + x[0] * basis.row_gradient[b, sample, 0]
+        basis.row[row, b] = value + x[1] * basis.row_gradient[b, sample, 1] + x[2] * basis.row_gradient[b, sample, 2]
