@@ -2,7 +2,7 @@
 
 A sample stands for a cell of the surface, of the area A at rest. Its contact is the mean of springs over the gaps of
 that cell, which tilt and curvature spread evenly over a range e, the *onset* (see ``penalty_kernels``). With the normal
-n of what is touched, the rest normal N and F of the body where it would be at the end of the step,
+n of what is touched, the rest normal N and F of the body a step's velocity ahead,
 
     m = P_N F^T n                               slope of the gap over the cell
     t = |m| L,  L = sqrt(3 A / pi)              range by tilt: that of a strip with the variance of a disc of area A
@@ -21,7 +21,7 @@ import warp as wp
 from softmode.deformables.model.declare import struct
 from softmode.deformables.model.deformation_kernels import displacement_gradient
 from softmode.deformables.model.lane_kernels import vec8d
-from softmode.deformables.model.struct_kernels import SLOTS, Basis, Instances
+from softmode.deformables.model.struct_kernels import SLOTS, Basis, Instances, Motion, interpolate
 
 wp.set_module_options({"enable_backward": False})
 
@@ -128,6 +128,20 @@ def gradient_of(instances: Instances, basis: Basis, q: wp.array2d[vec8d], i: int
     """Return the deformation gradient F of an instance at a surface sample."""
     G = displacement_gradient(basis.row_gradient, q, i, row, instances.function_count[i])
     return wp.identity(n=3, dtype=wp.float64) + G
+
+
+@wp.func
+def ahead_of(
+    instances: Instances, basis: Basis, motion: Motion, start: wp.mat33d, n: wp.vec3d, i: int, row: int, dt: float
+):
+    """Return F of a sample and how far it moves along n [m] where it goes on for a step at its velocity.
+
+    How far a ball rolls in a step is what turns it: a centre of pressure of the start would lag by half a step.
+    """
+    count = instances.function_count[i]
+    h = wp.float64(dt)
+    rate = displacement_gradient(basis.row_gradient, motion.qd_start, i, row, count)
+    return start + h * rate, h * wp.dot(n, interpolate(basis.row, row, motion.qd_start, i, count))
 
 
 @wp.func

@@ -12,6 +12,7 @@ import warp as wp
 
 from softmode.deformables.contact.cell_kernels import (
     Surface,
+    ahead_of,
     cell_at,
     gradient_of,
     shape_curvature,
@@ -551,13 +552,11 @@ def gather_contacts(
         gap = wp.max(samples.gap[i, s, slot], deepest)
         # of unit length in float64: what is left of the gap in the slip must not count against the stick range
         normal = wp.normalize(wp.vec3d(samples.normal[i, s, slot]))
-        # the cell and its centre of pressure where the body would be without forces: how far a ball rolls in a step
-        # is what turns it
         cell_shape = shape_of_cell(surface, instances, basis, i, row, curvature_of(shapes, shape, normal))
         start = gradient_of(instances, basis, motion.q_start, i, row)
-        ahead = gradient_of(instances, basis, motion.q_inertial, i, row)
-        approach = wp.vec3d(samples.drift[i, s] - shape_drift(shapes, shape, wp.vec3(samples.position[i, s]), dt))
-        cell = cell_at(cell_shape, ahead, normal, gap + wp.dot(normal, approach))
+        ahead, closing = ahead_of(instances, basis, motion, start, normal, i, row, dt)
+        closing -= wp.dot(normal, wp.vec3d(shape_drift(shapes, shape, wp.vec3(samples.position[i, s]), dt)))
+        cell = cell_at(cell_shape, ahead, normal, gap + closing)
         spared = float(spared_share(surface, samples.shape, samples.gap, cell_shape, cell.fade, i, row, shape))
         turned = wp.dot(normal, (ahead - start) * cell.centre)
         # both bodies feel the force at one point, not the shape at its own surface: a pair of forces on two

@@ -242,6 +242,15 @@ def dent_exponents(instances: Instances, i: int):
     return wp.vec4d(-one, wp.float64(-2.0) * nu / (one - nu * nu), wp.float64(0.0), -one)
 
 
+@wp.func
+def shear_exponents(instances: Instances, i: int):
+    """Return d ln of the compliance of a dent along the surface over that across, by the same."""
+    zero = wp.float64(0.0)
+    one = wp.float64(1.0)
+    nu = wp.float64(instances.poissons_ratio[i])
+    return wp.vec4d(zero, one / (one - nu) - one / (wp.float64(2.0) - nu), zero, zero)
+
+
 @wp.kernel
 def sum_reactions(
     instances: Instances,

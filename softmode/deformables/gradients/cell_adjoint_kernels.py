@@ -1,0 +1,271 @@
+"""Device side of the adjoint through what a contact takes from the start of the step: its cell, and what touches around.
+
+Onset, centre of pressure T and the fade of the neighbourhood follow the gradient F and the gap of the sample a step's
+velocity ahead, and the share of the neighbourhood that does not touch follows the gaps of its samples at the start; see
+``cell_kernels``. With lambda the costate, a contact's row b + T . grad b, force f and displacement x feel T by
+
+    dL/dT = (grad lambda)^T f - (grad (q_t - q_(t-1)))^T x_bar + (n . x_bar) (F_ahead - F_start)^T n,
+
+x_bar = -dL/dx, the last of the offset, which leaves out what T closes by turning.
+"""
+
+import warp as wp
+
+from softmode.deformables.contact.cell_kernels import (
+    PI,
+    CellShape,
+    Surface,
+    ahead_of,
+    cell_at,
+    gradient_of,
+    neighbour_at,
+    shape_of_cell,
+    spared_share,
+    write_row,
+)
+from softmode.deformables.contact.detection_kernels import Shapes, curvature_of, shape_drift
+from softmode.deformables.contact.penalty_kernels import HARDENING, HARDENING_DEPTH, penalty
+from softmode.deformables.gradients.adjoint_kernels import Linearised, Sums
+from softmode.deformables.model.deformation_kernels import displacement_gradient
+from softmode.deformables.model.lane_kernels import vec8d
+from softmode.deformables.model.struct_kernels import (
+    OVERLAP,
+    SLOTS,
+    Basis,
+    Instances,
+    Motion,
+    PointConstraints,
+    Samples,
+    interpolate,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def gap_of(instances: Instances, samples: Samples, i: int, sample: int, shape: int):
+    """Return the gap [m] of a sample with a shape at the start of the step, as its contact takes it."""
+    s = sample - instances.row_start[i]
+    gap = samples.gap[i, s, 0]
+    for slot in range(1, SLOTS):
+        if samples.shape[i, s, slot] == shape:
+            gap = samples.gap[i, s, slot]
+    return wp.max(gap, -wp.float64(OVERLAP * instances.size[i]))
+
+
+@wp.func
+def cell_loss(
+    shape: CellShape,
+    F: wp.mat33d,
+    n: wp.vec3d,
+    gap: wp.float64,
+    onset_bar: wp.float64,
+    fade_bar: wp.float64,
+    centre_bar: wp.vec3d,
+):
+    """Return the loss to first order in what ``cell_at`` returns."""
+    cell = cell_at(shape, F, n, gap)
+    return onset_bar * cell.onset + fade_bar * cell.fade + wp.dot(centre_bar, cell.centre)
+
+
+@wp.func
+def by_onset(p: wp.float64, eps: wp.float64):
+    """Return the derivative of the slope of the penalty by its range."""
+    half = wp.float64(0.5)
+    x = wp.min(wp.max(p, wp.float64(0.0)) / eps, wp.float64(1.0))
+    return -half * x * x
+
+
+@wp.func
+def slope_of_touching(y: wp.float64):
+    """Return the derivative of ``touching``."""
+    if y <= wp.float64(0.0) or y >= wp.float64(1.0):
+        return wp.float64(0.0)
+    return wp.float64(6.0) * y * (wp.float64(1.0) - y)
+
+
+@wp.kernel
+def restore_rows(
+    instances: Instances,
+    basis: Basis,
+    motion: Motion,
+    shapes: Shapes,
+    samples: Samples,
+    surface: Surface,
+    constraints: PointConstraints,
+    dt: float,
+):
+    """Write the rows at the centres of pressure of a recorded step."""
+    i, e = wp.tid()
+    if e < instances.pin_count[i] or e >= constraints.count[i]:
+        return
+    row = constraints.partner_row[i, e]
+    if constraints.row[i, e] == row:
+        return
+    shape = constraints.shape[i, e]
+    n = constraints.normal[i, e]
+    start = gradient_of(instances, basis, motion.q_start, i, row)
+    ahead, closing = ahead_of(instances, basis, motion, start, n, i, row, dt)
+    x = wp.vec3(samples.position[i, row - instances.row_start[i]])
+    closing -= wp.dot(n, wp.vec3d(shape_drift(shapes, shape, x, dt)))
+    cell_shape = shape_of_cell(surface, instances, basis, i, row, curvature_of(shapes, shape, n))
+    cell = cell_at(cell_shape, ahead, n, gap_of(instances, samples, i, row, shape) + closing)
+    write_row(basis, constraints.row[i, e], row, cell.centre)
+
+
+@wp.kernel
+def accumulate_cells(
+    instances: Instances,
+    basis: Basis,
+    motion: Motion,
+    shapes: Shapes,
+    samples: Samples,
+    surface: Surface,
+    constraints: PointConstraints,
+    q: wp.array2d[vec8d],
+    costate: wp.array2d[vec8d],
+    dt: float,
+    # In and out:
+    sums: Sums,
+    step: Linearised,
+):
+    """Find the loss by the cell of each contact; add what the scale of the body does to it."""
+    i, e = wp.tid()
+    step.cell_gradient[i, e] = wp.mat33d()
+    step.cell_place[i, e] = wp.vec3d()
+    step.cell_spared[i, e] = wp.float64(0.0)
+    if e < instances.pin_count[i] or e >= constraints.count[i]:
+        return
+    zero = wp.float64(0.0)
+    half = wp.float64(0.5)
+    count = instances.function_count[i]
+    row = constraints.partner_row[i, e]
+    shape = constraints.shape[i, e]
+    n = constraints.normal[i, e]
+    k = constraints.stiffness[i, e]
+    eps = constraints.onset[i, e]
+    depth = constraints.dent_depth[i, e]
+    p = -wp.dot(n, constraints.offset[i, e] + constraints.displacement[i, e])
+    deep = HARDENING_DEPTH * eps
+    share = wp.float64(1.0) / (wp.float64(1.0) + k * constraints.dent_compliance[i, e])
+    _psi, _slope, curvature = penalty(p, eps)
+    _deep_psi, _deep_slope, deep_curvature = penalty(p - depth - deep, deep)
+    steep = HARDENING * deep_curvature
+    total_curvature = share * curvature + steep
+    force_bar = k * step.normal_bar[i, e][0]
+    onset_bar = share * by_onset(p, eps) + HARDENING_DEPTH * (HARDENING * by_onset(p - depth - deep, deep) - steep)
+    onset_bar = force_bar * (onset_bar + half * total_curvature)
+    depth_bar = -force_bar * steep * depth
+
+    start = gradient_of(instances, basis, motion.q_start, i, row)
+    ahead, closing = ahead_of(instances, basis, motion, start, n, i, row, dt)
+    x = wp.vec3(samples.position[i, row - instances.row_start[i]])
+    closing -= wp.dot(n, wp.vec3d(shape_drift(shapes, shape, x, dt)))
+    gap = gap_of(instances, samples, i, row, shape) + closing
+    other = curvature_of(shapes, shape, n)
+    cell_shape = shape_of_cell(surface, instances, basis, i, row, other)
+    cell = cell_at(cell_shape, ahead, n, gap)
+    spared = spared_share(surface, samples.shape, samples.gap, cell_shape, cell.fade, i, row, shape)
+    spared_bar = zero
+    if spared > zero:
+        spared_bar = (step.normal_bar[i, e][1] + depth_bar) / spared
+    step.cell_spared[i, e] = spared_bar
+    by_gap = zero
+    by_fade = zero
+    for m in range(surface.start[row], surface.start[row + 1]):
+        t = surface.neighbour[m]
+        for slot in range(SLOTS):
+            if samples.shape[i, t, slot] == shape:
+                y = neighbour_at(cell_shape, cell.fade, samples.gap[i, t, slot])
+                change = wp.float64(surface.weight[m]) * slope_of_touching(y) / cell.fade
+                by_gap += change
+                by_fade -= (wp.float64(1.0) - y) * change
+
+    back = step.contact_bar[i, e]
+    along = wp.dot(n, back)
+    centre_bar = wp.vec3d()
+    if constraints.row[i, e] != row:
+        moved = displacement_gradient(basis.row_gradient, q, i, row, count) - (start - wp.identity(n=3, dtype=wp.float64))
+        pulled = displacement_gradient(basis.row_gradient, costate, i, row, count)
+        centre_bar = wp.transpose(pulled) * constraints.force[i, e] - wp.transpose(moved) * back
+        centre_bar += along * (wp.transpose(ahead - start) * n)
+    by_shape, by_F, _by_n, by_place, _o, _f, _c = wp.grad(cell_loss)(
+        cell_shape, ahead, n, gap, onset_bar, spared_bar * by_fade, centre_bar
+    )
+    step.cell_gradient[i, e] = by_F + along * wp.outer(n, cell.centre)
+    step.cell_place[i, e] = by_place * n
+
+    # lengths grow with the scale, but not the radius of what is touched
+    touched = half * spared_bar * by_gap
+    bend_bar = by_shape.bend + touched - half * force_bar * total_curvature
+    area = wp.float64(instances.scale[i] * instances.scale[i] * basis.row_area[row])
+    by_scale = depth_bar + by_shape.fade * cell_shape.fade + by_shape.steepest * cell_shape.steepest
+    by_scale += (by_shape.least - touched) * cell_shape.least
+    if cell_shape.bend > zero:
+        by_scale += bend_bar * (cell_shape.bend + area * wp.float64(other) / (wp.float64(2.0) * PI))
+    sums.contact[i, e] = sums.contact[i, e] + wp.vec4d(zero, zero, zero, by_scale)
+
+
+@wp.kernel
+def spread_over_neighbours(
+    instances: Instances,
+    basis: Basis,
+    motion: Motion,
+    shapes: Shapes,
+    samples: Samples,
+    surface: Surface,
+    constraints: PointConstraints,
+    dt: float,
+    # In and out:
+    step: Linearised,
+):
+    """Sum the loss by the gap of each sample over the contacts whose neighbourhood it is in, in their order."""
+    i = wp.tid()
+    for s in range(instances.sample_count[i]):
+        step.sample_place[i, s] = wp.vec3d()
+    for e in range(instances.pin_count[i], constraints.count[i]):
+        if step.cell_spared[i, e] == wp.float64(0.0):
+            continue
+        row = constraints.partner_row[i, e]
+        shape = constraints.shape[i, e]
+        n = constraints.normal[i, e]
+        start = gradient_of(instances, basis, motion.q_start, i, row)
+        ahead, _closing = ahead_of(instances, basis, motion, start, n, i, row, dt)
+        cell_shape = shape_of_cell(surface, instances, basis, i, row, curvature_of(shapes, shape, n))
+        fade = cell_at(cell_shape, ahead, n, wp.float64(0.0)).fade
+        for m in range(surface.start[row], surface.start[row + 1]):
+            t = surface.neighbour[m]
+            for slot in range(SLOTS):
+                if samples.shape[i, t, slot] == shape:
+                    y = neighbour_at(cell_shape, fade, samples.gap[i, t, slot])
+                    change = wp.float64(surface.weight[m]) * slope_of_touching(y) / fade
+                    step.sample_place[i, t] = step.sample_place[i, t] + step.cell_spared[i, e] * change * n
+
+
+@wp.kernel
+def propagate_cells(
+    instances: Instances,
+    basis: Basis,
+    constraints: PointConstraints,
+    step: Linearised,
+    dt: wp.float64,
+    # In and out: dL/dq and dL/dv at the start of the step
+    q_bar: wp.array2d[vec8d],
+    qd_bar: wp.array2d[vec8d],
+):
+    """Pass the loss by cells and gaps to the start of the step."""
+    i, e = wp.tid()
+    stride = basis.row.shape[1]
+    b = e % stride
+    axis = e / stride
+    ahead = vec8d()
+    for k in range(instances.pin_count[i], constraints.count[i]):
+        row = constraints.partner_row[i, k]
+        ahead = ahead + step.cell_place[i, k][axis] * vec8d(basis.row[row, b])
+        for j in range(3):
+            ahead = ahead + step.cell_gradient[i, k][axis, j] * vec8d(basis.row_gradient[b, row, j])
+    start = vec8d()
+    for s in range(instances.sample_count[i]):
+        start = start + step.sample_place[i, s][axis] * vec8d(basis.row[instances.row_start[i] + s, b])
+    q_bar[i, e] = q_bar[i, e] + ahead + start
+    qd_bar[i, e] = qd_bar[i, e] + dt * ahead
