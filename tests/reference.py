@@ -187,22 +187,23 @@ def penalty(p: np.ndarray, eps: float) -> np.ndarray:
 
 
 def dent(penetration: np.ndarray, eps: float | np.ndarray, ratio: float | np.ndarray) -> np.ndarray:
-    """Return the dent p - x at the minimum over x of penalty(x) + (p - x)^2 / (2 ratio), by bisection [m]."""
+    """Return the mean dent of springs over gaps spread evenly over eps, r / (1 + r) of what each gives [m]."""
     p = np.maximum(penetration, 0.0)
-    low, high = np.zeros_like(p), p.copy()
-    for _ in range(200):
-        x = 0.5 * (low + high)
-        deep = x + ratio * np.where(x < eps, x * x / (2 * eps), x - eps / 2) > p
-        low, high = np.where(deep, low, x), np.where(deep, x, high)
-    return p - x
+    return ratio / (1.0 + ratio) * np.where(p < eps, p * p / (2 * eps), p - eps / 2)
 
 
 def dented_penalty(penetration: np.ndarray, eps: float, ratio: float) -> np.ndarray:
-    """Return min_x penalty(x) + (p - x)^2 / (2 ratio)."""
-    if ratio == 0.0:
-        return penalty(penetration, eps)
-    v = dent(penetration, eps, ratio)
-    return penalty(np.maximum(penetration, 0.0) - v, eps) + v**2 / (2 * ratio)
+    """Return the mean over gaps x in [0, eps] of min_v (p - x - v)^2 / 2 + v^2 / (2 ratio), by Gauss's rule.
+
+    Of two springs in series, v the dent; nothing where p < x.
+    """
+    x, weight = np.polynomial.legendre.leggauss(8)
+    p = np.maximum(np.asarray(penetration), 0.0)
+    reach = np.minimum(p, eps)  # gaps beyond p are open
+    deep = p[..., None] - 0.5 * reach[..., None] * (x + 1.0)
+    v = ratio / (1.0 + ratio) * deep
+    energy = 0.5 * (deep - v) ** 2 + (v**2 / (2.0 * ratio) if ratio else 0.0)
+    return reach / eps * (0.5 * weight * energy).sum(axis=-1)
 
 
 def normal_potential(penetration: np.ndarray, eps: float, ratio: float = 0.0, depth: float = 0.0) -> np.ndarray:

@@ -269,7 +269,7 @@ def test_stick_is_the_return_map():
     count = int(entries.count.numpy()[0])
     f, k = entries.force.numpy()[0, :count], entries.stick.numpy()[0, :count]
     shapes, points = memory(scene)
-    rows = entries.row.numpy()[0, :count]
+    rows = entries.partner_row.numpy()[0, :count]
     held = (f**2).sum(axis=1) > 0.0
     world = points[rows, 0] @ rotation((0, 1, 0), np.arctan(1.5 * MU)).T
     n = entries.normal.numpy()[0, :count]

@@ -5,7 +5,8 @@ that cell, which tilt and curvature spread evenly over a range e, the *onset* (s
 n of what is touched, the rest normal N and F of the body a step's velocity ahead,
 
     m = P_N F^T n                               slope of the gap over the cell
-    t = |m| L,  L = sqrt(3 A / pi)              range by tilt: that of a strip with the variance of a disc of area A
+    t = |m| L r/(1 + r),  L = sqrt(3 A / pi)    range by tilt: that of a strip with the variance of a disc of area A;
+                                                r: compliance of the dent over that of the penalty
     b = A (H + H_other) / (2 pi)                range by the mean curvatures of both: exact for a sphere
     e = sqrt(e_0^2 + t^2 + b^2)                 e_0: ``contact_smoothing``
     T = -min(L/2 - q L/(3 t), L t/(6 q)) m/|m|  centre of pressure from the sample, at rest, q = e/2 - gap - b/2 in the
@@ -26,8 +27,7 @@ from softmode.deformables.model.struct_kernels import SLOTS, Basis, Instances, M
 wp.set_module_options({"enable_backward": False})
 
 SPHERE, CAPSULE, CYLINDER = (
-    wp.constant(int(kind))
-    for kind in (newton.GeoType.SPHERE, newton.GeoType.CAPSULE, newton.GeoType.CYLINDER)
+    wp.constant(int(kind)) for kind in (newton.GeoType.SPHERE, newton.GeoType.CAPSULE, newton.GeoType.CYLINDER)
 )
 PI = wp.constant(wp.float64(3.14159265358979))
 FADE = wp.constant(1.0e-3)
@@ -59,7 +59,6 @@ class Cell:
     """The cell of a sample in a contact."""
 
     onset: wp.float64  # range of its gaps [m]
-    fade: wp.float64  # range of the gap over which a neighbour counts as touching less and less [m]
     centre: wp.vec3d  # centre of pressure from the sample, at rest [m]
 
 
@@ -92,23 +91,37 @@ def shape_of_cell(surface: Surface, instances: Instances, basis: Basis, i: int, 
 
 
 @wp.func
-def cell_at(shape: CellShape, F: wp.mat33d, n: wp.vec3d, gap: wp.float64):
-    """Return a cell where its body has the gradient F and its sample a gap [m]; n is the normal of what it touches."""
-    half = wp.float64(0.5)
-    zero = wp.float64(0.0)
+def lean_of(shape: CellShape, F: wp.mat33d, n: wp.vec3d):
+    """Return t m / |m| of a cell [m] whose body has the gradient F; n is the normal of what it touches."""
+    one = wp.float64(1.0)
     pull = wp.transpose(F) * n
     facing = -wp.dot(pull, shape.normal)
-    along = pull + facing * shape.normal
-    slope = wp.length(along)
-    tilt = zero
-    if facing > FACING * wp.length(pull):
-        tilt = slope * shape.width
-        share = tilt / shape.steepest
-        tilt = tilt / wp.sqrt(wp.sqrt(wp.float64(1.0) + share * share * share * share))
-    ranges = tilt * tilt + shape.bend * shape.bend
+    if facing <= FACING * wp.length(pull):
+        return wp.vec3d()
+    lean = shape.width * (pull + facing * shape.normal)
+    share = wp.length_sq(lean) / (shape.steepest * shape.steepest)
+    return lean / wp.sqrt(wp.sqrt(one + share * share))
+
+
+@wp.func
+def fade_of(shape: CellShape, F: wp.mat33d, n: wp.vec3d):
+    """Return the range of the gap over which a neighbour counts as touching less and less [m]."""
+    return shape.fade + wp.sqrt(wp.length_sq(lean_of(shape, F, n)) + shape.bend * shape.bend)
+
+
+@wp.func
+def cell_at(shape: CellShape, F: wp.mat33d, n: wp.vec3d, gap: wp.float64, ratio: wp.float64):
+    """Return a cell where its sample has a gap [m], and its dent ``ratio`` times the compliance of the penalty.
+
+    The cell turns with the dent: where there is none and the penalty alone keeps surfaces apart, so stiff a centre of
+    pressure would move the body to and fro.
+    """
+    half = wp.float64(0.5)
+    zero = wp.float64(0.0)
+    lean = ratio / (wp.float64(1.0) + ratio) * lean_of(shape, F, n)
+    tilt = wp.length(lean)
     cell = Cell()
-    cell.onset = wp.sqrt(shape.least * shape.least + ranges)
-    cell.fade = shape.fade + wp.sqrt(ranges)
+    cell.onset = wp.sqrt(shape.least * shape.least + shape.bend * shape.bend + tilt * tilt)
     if tilt > LEVEL * shape.least:
         p = -(gap + half * shape.bend)
         q = p + half * cell.onset
@@ -119,7 +132,7 @@ def cell_at(shape: CellShape, F: wp.mat33d, n: wp.vec3d, gap: wp.float64):
             if q < tilt:
                 at -= q * shape.width / (wp.float64(3.0) * tilt)
             at = wp.min(at, shape.width * tilt / (wp.float64(6.0) * q))
-        cell.centre = -at / slope * along
+        cell.centre = -at / tilt * lean
     return cell
 
 

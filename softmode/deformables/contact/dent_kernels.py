@@ -1,8 +1,8 @@
 """Device code of the dents that a step leaves: how far the skin lies outside of what the functions of a body say.
 
-A contact sinks in by p = x + v: the penalty takes x, the dent v, a share r / (1 + r) of what the springs of a cell give,
-see ``penalty_kernels``. The functions move a sample by p; the skin that one sees and touches has moved by v less, along
-the normal of the contact.
+A contact sinks in by p = x + v: the penalty takes x, the dent v, a share r / (1 + r) of what the springs of a cell
+give, see ``penalty_kernels``. The functions move a sample by p; the skin that one sees and touches has moved by v less,
+along the normal of the contact.
 """
 
 import warp as wp

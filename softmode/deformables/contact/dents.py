@@ -33,7 +33,8 @@ from softmode.deformables.model.tables import allocate
 Array = NDArray[np.float64]
 
 DENT_FACTOR = 0.39
-"""Dent where nothing around is touched over the size of what the functions resolve, under the pressure E / (1 - nu^2)."""
+"""Dent over the size of what the functions resolve, under the pressure E / (1 - nu^2), where nothing around is touched.
+"""
 WALL_SHARE = 0.6
 """Bound of that size as a share of the thickness below a sample."""
 COVER = 1.6
@@ -95,7 +96,9 @@ def mean_curvature(body: ReducedBody) -> Array:
     return (same * (d * dn).sum(-1)).sum(1) / np.maximum((same * (d * d).sum(-1)).sum(1), 1e-30)
 
 
-def surface_table(bodies: Sequence[ReducedBody], stiffness: Array, first_row: int, row_max: int, device: wp.Device) -> Surface:
+def surface_table(
+    bodies: Sequence[ReducedBody], stiffness: Array, first_row: int, row_max: int, device: wp.Device
+) -> Surface:
     """Return what contact knows of the surfaces of all bodies.
 
     Args:

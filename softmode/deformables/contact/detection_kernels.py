@@ -14,6 +14,7 @@ from softmode.deformables.contact.cell_kernels import (
     Surface,
     ahead_of,
     cell_at,
+    fade_of,
     gradient_of,
     shape_curvature,
     shape_of_cell,
@@ -556,8 +557,19 @@ def gather_contacts(
         start = gradient_of(instances, basis, motion.q_start, i, row)
         ahead, closing = ahead_of(instances, basis, motion, start, normal, i, row, dt)
         closing -= wp.dot(normal, wp.vec3d(shape_drift(shapes, shape, wp.vec3(samples.position[i, s]), dt)))
-        cell = cell_at(cell_shape, ahead, normal, gap + closing)
-        spared = float(spared_share(surface, samples.shape, samples.gap, cell_shape, cell.fade, i, row, shape))
+        fade = fade_of(cell_shape, ahead, normal)
+        spared = float(spared_share(surface, samples.shape, samples.gap, cell_shape, fade, i, row, shape))
+        area = wp.max(sample_area(instances.scale[i], basis.row_area[row]), 1.0e-30)
+        relative = surface.relative_stiffness[row]
+        partner_mass = float(0.0)
+        if shapes.body[shape] >= 0 and prescribed == 0:
+            partner_mass = shapes.body_mass[shapes.body[shape]]
+        partner_area = shape_area(shapes, shape)
+        firm = relative * surface.slenderness[row]
+        kappa = stiffness_per_area(instances, i, BULK_FACTOR, firm, partner_mass, partner_area, dt)
+        stiffness = wp.float64(kappa * area)
+        compliance = wp.float64(spared * dent_compliance(instances, i, relative, surface.dent_length[row]) / area)
+        cell = cell_at(cell_shape, ahead, normal, gap + closing, stiffness * compliance)
         turned = wp.dot(normal, (ahead - start) * cell.centre)
         # both bodies feel the force at one point, not the shape at its own surface: a pair of forces on two
         # points would make angular momentum out of friction times penetration
@@ -576,17 +588,7 @@ def gather_contacts(
         constraints.body[i, e] = body
         constraints.arm[i, e] = arm
         constraints.normal[i, e] = normal
-        partner_mass = float(0.0)
-        if body >= 0 and prescribed == 0:
-            partner_mass = shapes.body_mass[body]
-        relative = surface.relative_stiffness[row]
-        partner_area = shape_area(shapes, shape)
-        firm = relative * surface.slenderness[row]
-        kappa = stiffness_per_area(instances, i, BULK_FACTOR, firm, partner_mass, partner_area, dt)
         shear = stiffness_per_area(instances, i, SHEAR_FACTOR, relative, partner_mass, partner_area, dt)
-        area = wp.max(sample_area(instances.scale[i], basis.row_area[row]), 1.0e-30)
-        stiffness = wp.float64(kappa * area)
-        compliance = wp.float64(spared * dent_compliance(instances, i, relative, surface.dent_length[row]) / area)
         edged = (SMOOTH >> shapes.kind[shape]) & 1 == 0
         slip, anchor = remembered_slip(
             shapes,

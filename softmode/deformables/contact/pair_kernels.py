@@ -24,7 +24,14 @@ whose row is the difference.
 
 import warp as wp
 
-from softmode.deformables.contact.cell_kernels import Surface, cell_at, gradient_of, shape_of_cell, spared_share
+from softmode.deformables.contact.cell_kernels import (
+    Surface,
+    cell_at,
+    fade_of,
+    gradient_of,
+    shape_of_cell,
+    spared_share,
+)
 from softmode.deformables.contact.detection_kernels import rank_contacts
 from softmode.deformables.contact.penalty_kernels import (
     BULK_FACTOR,
@@ -522,13 +529,15 @@ def write_pairs(
     shear = wp.float64(layers_in_series(instances, i, j, SHEAR_FACTOR, ri, rj, dt) * half_area)
     n = pairs.normal[i, s, slot]
     mine = shape_of_cell(surface, instances, basis, i, own, surface.curvature[at] / instances.scale[j])
-    cell = cell_at(mine, gradient_of(instances, basis, motion.q_start, i, own), n, pairs.gap[i, s, slot])
+    F_own = gradient_of(instances, basis, motion.q_start, i, own)
+    fade = fade_of(mine, F_own, n)
     theirs = shape_of_cell(surface, instances, basis, j, at, surface.curvature[own] / instances.scale[i])
-    spared_i = float(spared_share(surface, pairs.other, pairs.gap, mine, cell.fade, i, own, j))
-    spared_j = float(spared_share(surface, pairs.other, pairs.gap, theirs, cell.fade, j, at, i))
+    spared_i = float(spared_share(surface, pairs.other, pairs.gap, mine, fade, i, own, j))
+    spared_j = float(spared_share(surface, pairs.other, pairs.gap, theirs, fade, j, at, i))
     wi = wp.float64(spared_i * dent_compliance(instances, i, ri, surface.dent_length[own]) / half_area)
     wj = wp.float64(spared_j * dent_compliance(instances, j, rj, surface.dent_length[at]) / half_area)
     compliance = wi + wj
+    cell = cell_at(mine, F_own, n, pairs.gap[i, s, slot], stiffness * compliance)
     stick = stick_ratio * shear
     stick = stick / (wp.float64(1.0) + stick * (shear_yield(instances, i, wi) + shear_yield(instances, j, wj)))
     pairs.share[i, s, slot] = float(wi / wp.max(compliance, wp.float64(1.0e-30)))
@@ -544,7 +553,7 @@ def write_pairs(
     particle = instances.particle_start[i] + s
     for before in range(SLOTS):
         if stick_partner[particle][before] == j - state.instance_start[instances.world[i]]:
-            slip = gradient_of(instances, basis, motion.q_start, i, instances.row_start[i] + s) * stick_slip[particle][before]
+            slip = F_own * stick_slip[particle][before]
             offset += slip - wp.dot(n, slip) * n
     pairs.held[i, s, slot] = pairs.constraint[i, k]
     for side in range(2):

@@ -63,8 +63,8 @@ def penalty(penetration: wp.float64, eps: wp.float64):
 def normal_potential(penetration: wp.float64, eps: wp.float64, ratio: wp.float64, depth: wp.float64):
     """Return the contact potential of a penetration [m] per unit stiffness, and its first two derivatives.
 
-    The C2 penalty of springs in series with the dent, 1 / (1 + ratio) as stiff, and a stiffer penalty that sets in twice
-    as deep and as slowly, ``depth`` deeper where there is a dent.
+    The C2 penalty of springs in series with the dent, 1 / (1 + ratio) as stiff, and a stiffer penalty that sets in
+    twice as deep and as slowly, ``depth`` deeper where there is a dent.
 
     Args:
         penetration: p [m].

@@ -23,10 +23,10 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from softmode.checks import require_fields, require_number
+from softmode.deformables.contact.detection_kernels import place_samples
 from softmode.deformables.gradients import adjoint_kernels as kernels
 from softmode.deformables.gradients import cell_adjoint_kernels as cell_kernels
 from softmode.deformables.gradients import spin_adjoint_kernels as spin_kernels
-from softmode.deformables.contact.detection_kernels import place_samples
 from softmode.deformables.gradients.krylov import Gmres
 from softmode.deformables.gradients.turning_kernels import find_turning
 from softmode.deformables.model.declare import WRENCH
@@ -130,14 +130,15 @@ class AdjointReduced:
 
     Differentiated: elasticity, viscosity, inertia and mass damping, gravity, external forces, pins and driven functions
     (exactly); contact with flat faces: its stiffness, which follows E, nu, mass and size, its friction with the normal
-    force, and what friction remembers. Not differentiated: the turning of contact normals with the point of contact
+    force, what friction remembers, and what the cells of its samples and what touches around them take from the start
+    of the step. Not differentiated: the turning of contact normals with the point of contact
     (refused unless ``fixed_normals`` is set), contacts appearing or vanishing at the end of their detection range
     (where they carry no force), the motion of rigid shapes, and what BDF2 remembers from before the record. Parameters
     must not change between recording and ``backward``.
 
     Args:
         solver: The solver; rigid dofs must not take part in its solve.
-        step_max: Steps that can be recorded. A step keeps four vec3d per function, and 80 bytes per pin and, with
+        step_max: Steps that can be recorded. A step keeps four vec3d per function, and 112 bytes per pin and, with
             shapes in the model, per contact slot; ``backward`` takes as much again.
         options: Tolerances.
 
@@ -470,7 +471,7 @@ class AdjointReduced:
     def _pull_memory(self, k: int, q_bar: wp.array) -> None:
         """Add what the step after k feels of where its contacts stick to dL/dq_t."""
         t, constraints = self.tables, self._dims[1]
-        after = (self._constraint_count[k + 1], self._constraint["partner_row"][k + 1], self._constraint["shape"][k + 1])
+        after = (self._constraint_count[k + 1], *(self._constraint[name][k + 1] for name in ("partner_row", "shape")))
         t.launch(kernels.pull_memory, constraints, t.instances, t.shapes, t.constraints, *after, self._step)
         t.launch(kernels.add_memory, t.unknowns, t.instances, t.basis, t.constraints, self._step, q_bar)
 

@@ -16,8 +16,8 @@ from softmode.deformables.contact.penalty_kernels import (
     friction_potential,
     penalty,
     shear_exponents,
-    slip_potential,
     shear_yield,
+    slip_potential,
     stiffness_exponents,
 )
 from softmode.deformables.materials.hessian_kernels import stress_derivative
@@ -62,7 +62,7 @@ class Linearised:
     cell_gradient: wp.array2d[wp.mat33d]  # the loss by the gradient of a cell ahead, and
     cell_place: wp.array2d[wp.vec3d]  # by the sample's place ahead [1/m]
     cell_spared: wp.array2d[wp.float64]  # by the share of the neighbourhood that does not touch
-    sample_place: wp.array2d[wp.vec3d]  # (instance_count, sample_max), the loss by the sample's place at the start [1/m]
+    sample_place: wp.array2d[wp.vec3d]  # (instance_count, sample_max), the loss by its place at the start [1/m]
 
 
 @struct

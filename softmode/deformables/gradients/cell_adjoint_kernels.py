@@ -1,4 +1,4 @@
-"""Device side of the adjoint through what a contact takes from the start of the step: its cell, and what touches around.
+"""Device side of the adjoint through what a contact takes from the start of a step: its cell, what touches around it.
 
 Onset, centre of pressure T and the fade of the neighbourhood follow the gradient F and the gap of the sample a step's
 velocity ahead, and the share of the neighbourhood that does not touch follows the gaps of its samples at the start; see
@@ -17,14 +17,22 @@ from softmode.deformables.contact.cell_kernels import (
     Surface,
     ahead_of,
     cell_at,
+    fade_of,
     gradient_of,
     neighbour_at,
     shape_of_cell,
     spared_share,
     write_row,
 )
-from softmode.deformables.contact.detection_kernels import Shapes, curvature_of, shape_drift
-from softmode.deformables.contact.penalty_kernels import HARDENING, HARDENING_DEPTH, penalty
+from softmode.deformables.contact.detection_kernels import Shapes, curvature_of, shape_area, shape_drift
+from softmode.deformables.contact.penalty_kernels import (
+    BULK_FACTOR,
+    HARDENING,
+    HARDENING_DEPTH,
+    dent_exponents,
+    penalty,
+    stiffness_exponents,
+)
 from softmode.deformables.gradients.adjoint_kernels import Linearised, Sums
 from softmode.deformables.model.deformation_kernels import displacement_gradient
 from softmode.deformables.model.lane_kernels import vec8d
@@ -36,7 +44,6 @@ from softmode.deformables.model.struct_kernels import (
     Motion,
     PointConstraints,
     Samples,
-    interpolate,
 )
 
 wp.set_module_options({"enable_backward": False})
@@ -59,13 +66,13 @@ def cell_loss(
     F: wp.mat33d,
     n: wp.vec3d,
     gap: wp.float64,
+    ratio: wp.float64,
     onset_bar: wp.float64,
-    fade_bar: wp.float64,
     centre_bar: wp.vec3d,
 ):
     """Return the loss to first order in what ``cell_at`` returns."""
-    cell = cell_at(shape, F, n, gap)
-    return onset_bar * cell.onset + fade_bar * cell.fade + wp.dot(centre_bar, cell.centre)
+    cell = cell_at(shape, F, n, gap, ratio)
+    return onset_bar * cell.onset + wp.dot(centre_bar, cell.centre)
 
 
 @wp.func
@@ -109,7 +116,8 @@ def restore_rows(
     x = wp.vec3(samples.position[i, row - instances.row_start[i]])
     closing -= wp.dot(n, wp.vec3d(shape_drift(shapes, shape, x, dt)))
     cell_shape = shape_of_cell(surface, instances, basis, i, row, curvature_of(shapes, shape, n))
-    cell = cell_at(cell_shape, ahead, n, gap_of(instances, samples, i, row, shape) + closing)
+    ratio = constraints.stiffness[i, e] * constraints.dent_compliance[i, e]
+    cell = cell_at(cell_shape, ahead, n, gap_of(instances, samples, i, row, shape) + closing, ratio)
     write_row(basis, constraints.row[i, e], row, cell.centre)
 
 
@@ -147,7 +155,8 @@ def accumulate_cells(
     depth = constraints.dent_depth[i, e]
     p = -wp.dot(n, constraints.offset[i, e] + constraints.displacement[i, e])
     deep = HARDENING_DEPTH * eps
-    share = wp.float64(1.0) / (wp.float64(1.0) + k * constraints.dent_compliance[i, e])
+    ratio = k * constraints.dent_compliance[i, e]
+    share = wp.float64(1.0) / (wp.float64(1.0) + ratio)
     _psi, _slope, curvature = penalty(p, eps)
     _deep_psi, _deep_slope, deep_curvature = penalty(p - depth - deep, deep)
     steep = HARDENING * deep_curvature
@@ -164,20 +173,17 @@ def accumulate_cells(
     gap = gap_of(instances, samples, i, row, shape) + closing
     other = curvature_of(shapes, shape, n)
     cell_shape = shape_of_cell(surface, instances, basis, i, row, other)
-    cell = cell_at(cell_shape, ahead, n, gap)
-    spared = spared_share(surface, samples.shape, samples.gap, cell_shape, cell.fade, i, row, shape)
-    spared_bar = zero
-    if spared > zero:
-        spared_bar = (step.normal_bar[i, e][1] + depth_bar) / spared
-    step.cell_spared[i, e] = spared_bar
+    cell = cell_at(cell_shape, ahead, n, gap, ratio)
+    fade = fade_of(cell_shape, ahead, n)
+    spared = spared_share(surface, samples.shape, samples.gap, cell_shape, fade, i, row, shape)
     by_gap = zero
     by_fade = zero
     for m in range(surface.start[row], surface.start[row + 1]):
         t = surface.neighbour[m]
         for slot in range(SLOTS):
             if samples.shape[i, t, slot] == shape:
-                y = neighbour_at(cell_shape, cell.fade, samples.gap[i, t, slot])
-                change = wp.float64(surface.weight[m]) * slope_of_touching(y) / cell.fade
+                y = neighbour_at(cell_shape, fade, samples.gap[i, t, slot])
+                change = wp.float64(surface.weight[m]) * slope_of_touching(y) / fade
                 by_gap += change
                 by_fade -= (wp.float64(1.0) - y) * change
 
@@ -185,25 +191,36 @@ def accumulate_cells(
     along = wp.dot(n, back)
     centre_bar = wp.vec3d()
     if constraints.row[i, e] != row:
-        moved = displacement_gradient(basis.row_gradient, q, i, row, count) - (start - wp.identity(n=3, dtype=wp.float64))
+        moved = gradient_of(instances, basis, q, i, row) - start
         pulled = displacement_gradient(basis.row_gradient, costate, i, row, count)
         centre_bar = wp.transpose(pulled) * constraints.force[i, e] - wp.transpose(moved) * back
         centre_bar += along * (wp.transpose(ahead - start) * n)
-    by_shape, by_F, _by_n, by_place, _o, _f, _c = wp.grad(cell_loss)(
-        cell_shape, ahead, n, gap, onset_bar, spared_bar * by_fade, centre_bar
+    by_shape, by_F, _by_n, by_place, by_ratio, _o, _c = wp.grad(cell_loss)(
+        cell_shape, ahead, n, gap, ratio, onset_bar, centre_bar
     )
-    step.cell_gradient[i, e] = by_F + along * wp.outer(n, cell.centre)
+    by_log = by_ratio * ratio
+    spared_bar = zero
+    if spared > zero:
+        spared_bar = (step.normal_bar[i, e][1] + depth_bar + by_log) / spared
+    step.cell_spared[i, e] = spared_bar
+    fade_shape, fade_F, _fade_n = wp.grad(fade_of)(cell_shape, ahead, n)
+    fade_bar = spared_bar * by_fade
+    step.cell_gradient[i, e] = by_F + fade_bar * fade_F + along * wp.outer(n, cell.centre)
     step.cell_place[i, e] = by_place * n
 
     # lengths grow with the scale, but not the radius of what is touched
     touched = half * spared_bar * by_gap
-    bend_bar = by_shape.bend + touched - half * force_bar * total_curvature
+    bend_bar = by_shape.bend + fade_bar * fade_shape.bend + touched - half * force_bar * total_curvature
     area = wp.float64(instances.scale[i] * instances.scale[i] * basis.row_area[row])
-    by_scale = depth_bar + by_shape.fade * cell_shape.fade + by_shape.steepest * cell_shape.steepest
+    by_scale = depth_bar + fade_bar * fade_shape.fade * cell_shape.fade
+    by_scale += (by_shape.steepest + fade_bar * fade_shape.steepest) * cell_shape.steepest
     by_scale += (by_shape.least - touched) * cell_shape.least
     if cell_shape.bend > zero:
         by_scale += bend_bar * (cell_shape.bend + area * wp.float64(other) / (wp.float64(2.0) * PI))
-    sums.contact[i, e] = sums.contact[i, e] + wp.vec4d(zero, zero, zero, by_scale)
+    firm = surface.relative_stiffness[row] * surface.slenderness[row]
+    powers = stiffness_exponents(instances, i, BULK_FACTOR, firm, shape_area(shapes, shape), dt)
+    powers = by_log * (powers + dent_exponents(instances, i))
+    sums.contact[i, e] = sums.contact[i, e] + powers + wp.vec4d(zero, zero, zero, by_scale)
 
 
 @wp.kernel
@@ -232,7 +249,7 @@ def spread_over_neighbours(
         start = gradient_of(instances, basis, motion.q_start, i, row)
         ahead, _closing = ahead_of(instances, basis, motion, start, n, i, row, dt)
         cell_shape = shape_of_cell(surface, instances, basis, i, row, curvature_of(shapes, shape, n))
-        fade = cell_at(cell_shape, ahead, n, wp.float64(0.0)).fade
+        fade = fade_of(cell_shape, ahead, n)
         for m in range(surface.start[row], surface.start[row + 1]):
             t = surface.neighbour[m]
             for slot in range(SLOTS):

@@ -97,9 +97,7 @@ _EVALUATE = """
 
 
 @wp.func_native(
-    snippet=f"{{{SUMS}{lanes_code(contact_response, uniform=('stick_range',))}{_EVALUATE}}}".replace(
-        "KEEP", str(KEEP)
-    )
+    snippet=f"{{{SUMS}{lanes_code(contact_response, uniform=('stick_range',))}{_EVALUATE}}}".replace("KEEP", str(KEEP))
 )
 def evaluate_eight_constraints(
     constraints: PointConstraints,

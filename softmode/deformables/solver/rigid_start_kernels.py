@@ -161,9 +161,7 @@ def rigid_potential(
     for e in range(member, step.constraints.count[i] - step.constraints.pair_count[i], team):
         r = contact_arm(step.instances, step.constraints, step.rigid, samples, X, i, e)
         total = step.constraints.offset[i, e] + step.constraints.displacement[i, e]
-        value, _f, _H = contact_at(
-            step.constraints, step.options.stick_range, total + t + R * r - r, i, e, 0
-        )
+        value, _f, _H = contact_at(step.constraints, step.options.stick_range, total + t + R * r - r, i, e, 0)
         share += value
     weight = step.instances.mass[i] / (step.options.dt * step.options.dt)
     return team_sum(share) + rigid_share(weight, away, C, t, R)
@@ -229,9 +227,7 @@ def start_rigidly(step: NewtonStep, samples: Samples, team: int):
             r = contact_arm(step.instances, step.constraints, step.rigid, samples, X, i, e)
             arm = R * r
             total = step.constraints.offset[i, e] + step.constraints.displacement[i, e]
-            value, f, K = contact_at(
-                step.constraints, step.options.stick_range, total + t + arm - r, i, e, 1
-            )
+            value, f, K = contact_at(step.constraints, step.options.stick_range, total + t + arm - r, i, e, 1)
             lever = wp.skew(arm)
             share += value
             push += f

@@ -77,7 +77,8 @@ def normal_part(constraints: PointConstraints, i: int, e: int):
 def first_of_sample(constraints: PointConstraints, first: int, i: int, e: int):
     """Return whether no earlier constraint is the same sample pressed by the same body: its area counts once."""
     for k in range(first, e):
-        same = constraints.partner_row[i, k] == constraints.partner_row[i, e] and constraints.body[i, k] == constraints.body[i, e]
+        same = constraints.partner_row[i, k] == constraints.partner_row[i, e]
+        same = same and constraints.body[i, k] == constraints.body[i, e]
         if same and constraints.shape[i, k] >= 0 and normal_part(constraints, i, k) > wp.float64(0.0):
             return False
     return True
@@ -159,7 +160,8 @@ def read_contacts(
             if pressing > wp.float64(0.0):
                 touch = add_pressure(touch, pressing, x, n)
                 if first_of_sample(constraints, first, i, e):
-                    touch.area += wp.float64(sample_area(instances.scale[i], basis.row_area[constraints.partner_row[i, e]]))
+                    area = basis.row_area[constraints.partner_row[i, e]]
+                    touch.area += wp.float64(sample_area(instances.scale[i], area))
     if column < soft.shape[0]:
         write_readings(matrix_out, w, l, column, touch)
     else:
