@@ -186,12 +186,6 @@ def penalty(p: np.ndarray, eps: float) -> np.ndarray:
     return np.where(p < eps, p**3 / (6 * eps), p * p / 2 - eps * p / 2 + eps * eps / 6)
 
 
-def dent(penetration: np.ndarray, eps: float | np.ndarray, ratio: float | np.ndarray) -> np.ndarray:
-    """Return the mean dent of springs over gaps spread evenly over eps, r / (1 + r) of what each gives [m]."""
-    p = np.maximum(penetration, 0.0)
-    return ratio / (1.0 + ratio) * np.where(p < eps, p * p / (2 * eps), p - eps / 2)
-
-
 def dented_penalty(penetration: np.ndarray, eps: float, ratio: float) -> np.ndarray:
     """Return the mean over gaps x in [0, eps] of min_v (p - x - v)^2 / 2 + v^2 / (2 ratio), by Gauss's rule.
 

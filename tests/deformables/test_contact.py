@@ -208,8 +208,9 @@ def test_automatic_stiffness_is_that_of_the_touching_part(count):
     scene.step()
     entries, basis = scene.reduced.view.constraints, scene.reduced.view.basis
     touching = slice(0, int(entries.count.numpy()[0]))
-    row = entries.row.numpy()[0, touching]
-    own = row < body.surface_count  # of a pair, the samples of the body and not those of the other
+    own = entries.row.numpy()[0, touching] < len(basis.row_point)  # of a pair, the body's samples and not the other's
+    row = entries.row.numpy() if count == 2 else entries.partner_row.numpy()
+    row = row[0, touching]
     ratio = entries.stiffness.numpy()[0, touching][own] / basis.row_area.numpy()[row[own]]
     x, clear = body.surface_points[row[own], 0], np.abs(body.surface_points[row[own], 0]) > 0.2 * EDGE
     assert (x[clear] < 0.0).any() and (x[clear] > 0.0).any()

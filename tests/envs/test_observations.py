@@ -14,7 +14,6 @@ from softmode.deformables.contact.pairs import thickness
 from softmode.envs.scripted import scripted_policy
 from softmode.envs.soft_env import SoftEnv
 from softmode.robots import ArmDescription
-from tests import reference
 from tests.envs.conftest import MakeEnv
 
 Vector = NDArray[np.float64]
@@ -76,7 +75,8 @@ class HostState:
 
         By the law: a contact sinks in by p, of which a bed of springs of at most w = 0.39 min((V / n)^(1/3), 0.6 t)
         (1 - nu^2) / E takes its part in series with the penalty, along the normal; less where more of the neighbourhood
-        touches, as the solver says. Soft bodies that touch object 0 are refused.
+        touches, as the solver says, and from where the sample itself touches on. Soft bodies that touch object 0 are
+        refused.
         """
         body, view, data = self.scene.soft.body, self.scene.solver.view, self.scene.model.softmode
         young, ratio, scale = (float(getattr(data, name).numpy()[0]) for name in MATERIAL)
@@ -92,7 +92,7 @@ class HostState:
         assert (give <= (1.0 + 1.0e-5) * w[sample] / (scale**2 * body.surface_areas[sample])).all()
         softer = c.stiffness.numpy()[0, held] * give
         penetration = -np.einsum("ek,ek->e", normal, moved)
-        depth = reference.dent(penetration, c.onset.numpy()[0, held], softer)
+        depth = softer / (1.0 + softer) * np.maximum(penetration - c.lead.numpy()[0, held], 0.0)
         out = np.zeros((body.surface_count, 3))
         for s, n, v in zip(sample, normal, depth, strict=True):
             out[s] += max(v - n @ out[s], 0.0) * n

@@ -1,14 +1,12 @@
 """Device code of the dents that a step leaves: how far the skin lies outside of what the functions of a body say.
 
-A contact sinks in by p = x + v: the penalty takes x, the dent v, a share r / (1 + r) of what the springs of a cell
-give, see ``penalty_kernels``. The functions move a sample by p; the skin that one sees and touches has moved by v less,
-along the normal of the contact.
+A sample sinks in by p = x + v: the penalty takes x, the dent v, r / (1 + r) of it, see ``penalty_kernels``. The
+functions move a sample by p; the skin that one sees and touches has moved by v less, along the normal of the contact.
 """
 
 import warp as wp
 
 from softmode.deformables.contact.pair_kernels import Pairs
-from softmode.deformables.contact.penalty_kernels import penalty
 from softmode.deformables.model.struct_kernels import SLOTS, Instances, PointConstraints, Samples
 
 wp.set_module_options({"enable_backward": False})
@@ -29,8 +27,8 @@ def own_dent(constraints: PointConstraints, share: float, i: int, e: int):
     total = constraints.offset[i, e] + constraints.displacement[i, e]
     ratio = constraints.stiffness[i, e] * constraints.dent_compliance[i, e]
     penetration = -wp.dot(constraints.normal[i, e], total)
-    _psi, slope, _curvature = penalty(penetration, constraints.onset[i, e])
-    depth = share * float(ratio / (wp.float64(1.0) + ratio) * slope)
+    sunk = wp.max(penetration - constraints.lead[i, e], wp.float64(0.0))
+    depth = share * float(ratio / (wp.float64(1.0) + ratio) * sunk)
     return wp.where(wp.isfinite(depth), depth, 0.0)
 
 

@@ -166,9 +166,10 @@ def dent_weights(body: ReducedBody, points: ArrayLike) -> DentWeights:
 def contact_dents(constraints: PointConstraints) -> Array:
     """Return how far the bodies give way at the contacts of the last step [m], shape (instance_count, constraint_max).
 
-    Of two soft bodies the sum. Counts for contacts; pins and what lies beyond the count of an instance mean nothing.
-    Reads from the device.
+    At the samples; of two soft bodies the sum. Counts for contacts; pins and what lies beyond the count of an instance
+    mean nothing. Reads from the device.
     """
-    pressed = np.einsum("nek,nek->ne", constraints.normal.numpy(), constraints.force.numpy())
-    give = constraints.dent_compliance.numpy() * np.maximum(pressed, 0.0)
-    return np.minimum(give, constraints.dent_depth.numpy())  # from there on the stiffer penalty carries
+    total = constraints.offset.numpy() + constraints.displacement.numpy()
+    sunk = -np.einsum("nek,nek->ne", constraints.normal.numpy(), total) - constraints.lead.numpy()
+    ratio = constraints.stiffness.numpy() * constraints.dent_compliance.numpy()
+    return ratio / (1.0 + ratio) * np.maximum(sunk, 0.0)

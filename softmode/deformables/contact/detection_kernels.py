@@ -601,8 +601,9 @@ def gather_contacts(
             prescribed,
         )
         # d enters as offset + displacement, with the gap along the normal and the shape's own motion taken off
-        begin_at = gap - turned + wp.float64(0.5) * (cell_shape.bend - cell.onset)
-        constraints.offset[i, e] = begin_at * normal + slip - wp.vec3d(drift)
+        lead = wp.float64(0.5) * (cell.onset - cell_shape.bend)
+        constraints.offset[i, e] = (gap - turned - lead) * normal + slip - wp.vec3d(drift)
+        constraints.lead[i, e] = lead
         constraints.onset[i, e] = cell.onset
         constraints.anchor[i, e] = anchor
         stick = stick_ratio * wp.float64(shear * area)

@@ -91,36 +91,8 @@ def slope_of_touching(y: wp.float64):
     return wp.float64(6.0) * y * (wp.float64(1.0) - y)
 
 
-@wp.kernel
-def restore_rows(
-    instances: Instances,
-    basis: Basis,
-    motion: Motion,
-    shapes: Shapes,
-    samples: Samples,
-    surface: Surface,
-    constraints: PointConstraints,
-    dt: float,
-):
-    """Write the rows at the centres of pressure of a recorded step."""
-    i, e = wp.tid()
-    if e < instances.pin_count[i] or e >= constraints.count[i]:
-        return
-    row = constraints.partner_row[i, e]
-    if constraints.row[i, e] == row:
-        return
-    shape = constraints.shape[i, e]
-    n = constraints.normal[i, e]
-    start = gradient_of(instances, basis, motion.q_start, i, row)
-    ahead, closing = ahead_of(instances, basis, motion, start, n, i, row, dt)
-    x = wp.vec3(samples.position[i, row - instances.row_start[i]])
-    closing -= wp.dot(n, wp.vec3d(shape_drift(shapes, shape, x, dt)))
-    cell_shape = shape_of_cell(surface, instances, basis, i, row, curvature_of(shapes, shape, n))
-    ratio = constraints.stiffness[i, e] * constraints.dent_compliance[i, e]
-    cell = cell_at(cell_shape, ahead, n, gap_of(instances, samples, i, row, shape) + closing, ratio)
-    write_row(basis, constraints.row[i, e], row, cell.centre)
-
-
+# Warp writes the adjoints of what ``wp.grad`` calls only if nothing in the module called it before: so this kernel,
+# and ``wp.grad`` in it, come first.
 @wp.kernel
 def accumulate_cells(
     instances: Instances,
@@ -173,6 +145,18 @@ def accumulate_cells(
     gap = gap_of(instances, samples, i, row, shape) + closing
     other = curvature_of(shapes, shape, n)
     cell_shape = shape_of_cell(surface, instances, basis, i, row, other)
+    back = step.contact_bar[i, e]
+    along = wp.dot(n, back)
+    centre_bar = wp.vec3d()
+    if constraints.row[i, e] != row:
+        moved = gradient_of(instances, basis, q, i, row) - start
+        pulled = displacement_gradient(basis.row_gradient, costate, i, row, count)
+        centre_bar = wp.transpose(pulled) * constraints.force[i, e] - wp.transpose(moved) * back
+        centre_bar += along * (wp.transpose(ahead - start) * n)
+    by_shape, by_F, _by_n, by_place, by_ratio, _o, _c = wp.grad(cell_loss)(
+        cell_shape, ahead, n, gap, ratio, onset_bar, centre_bar
+    )
+    fade_shape, fade_F, _fade_n = wp.grad(fade_of)(cell_shape, ahead, n)
     cell = cell_at(cell_shape, ahead, n, gap, ratio)
     fade = fade_of(cell_shape, ahead, n)
     spared = spared_share(surface, samples.shape, samples.gap, cell_shape, fade, i, row, shape)
@@ -187,23 +171,11 @@ def accumulate_cells(
                 by_gap += change
                 by_fade -= (wp.float64(1.0) - y) * change
 
-    back = step.contact_bar[i, e]
-    along = wp.dot(n, back)
-    centre_bar = wp.vec3d()
-    if constraints.row[i, e] != row:
-        moved = gradient_of(instances, basis, q, i, row) - start
-        pulled = displacement_gradient(basis.row_gradient, costate, i, row, count)
-        centre_bar = wp.transpose(pulled) * constraints.force[i, e] - wp.transpose(moved) * back
-        centre_bar += along * (wp.transpose(ahead - start) * n)
-    by_shape, by_F, _by_n, by_place, by_ratio, _o, _c = wp.grad(cell_loss)(
-        cell_shape, ahead, n, gap, ratio, onset_bar, centre_bar
-    )
     by_log = by_ratio * ratio
     spared_bar = zero
     if spared > zero:
         spared_bar = (step.normal_bar[i, e][1] + depth_bar + by_log) / spared
     step.cell_spared[i, e] = spared_bar
-    fade_shape, fade_F, _fade_n = wp.grad(fade_of)(cell_shape, ahead, n)
     fade_bar = spared_bar * by_fade
     step.cell_gradient[i, e] = by_F + fade_bar * fade_F + along * wp.outer(n, cell.centre)
     step.cell_place[i, e] = by_place * n
@@ -221,6 +193,36 @@ def accumulate_cells(
     powers = stiffness_exponents(instances, i, BULK_FACTOR, firm, shape_area(shapes, shape), dt)
     powers = by_log * (powers + dent_exponents(instances, i))
     sums.contact[i, e] = sums.contact[i, e] + powers + wp.vec4d(zero, zero, zero, by_scale)
+
+
+@wp.kernel
+def restore_rows(
+    instances: Instances,
+    basis: Basis,
+    motion: Motion,
+    shapes: Shapes,
+    samples: Samples,
+    surface: Surface,
+    constraints: PointConstraints,
+    dt: float,
+):
+    """Write the rows at the centres of pressure of a recorded step."""
+    i, e = wp.tid()
+    if e < instances.pin_count[i] or e >= constraints.count[i]:
+        return
+    row = constraints.partner_row[i, e]
+    if constraints.row[i, e] == row:
+        return
+    shape = constraints.shape[i, e]
+    n = constraints.normal[i, e]
+    start = gradient_of(instances, basis, motion.q_start, i, row)
+    ahead, closing = ahead_of(instances, basis, motion, start, n, i, row, dt)
+    x = wp.vec3(samples.position[i, row - instances.row_start[i]])
+    closing -= wp.dot(n, wp.vec3d(shape_drift(shapes, shape, x, dt)))
+    cell_shape = shape_of_cell(surface, instances, basis, i, row, curvature_of(shapes, shape, n))
+    ratio = constraints.stiffness[i, e] * constraints.dent_compliance[i, e]
+    cell = cell_at(cell_shape, ahead, n, gap_of(instances, samples, i, row, shape) + closing, ratio)
+    write_row(basis, constraints.row[i, e], row, cell.centre)
 
 
 @wp.kernel

@@ -122,7 +122,8 @@ class PointConstraints:
     stiffness: wp.array2d[wp.float64]  # [N/m]
     dent_compliance: wp.array2d[wp.float64]  # contacts: of the dent in series with it [m/N]
     dent_depth: wp.array2d[wp.float64]  # contacts: dent from which on they harden [m]
-    onset: wp.array2d[wp.float64]  # contacts: range of the gaps of the sample's cell [m]
+    onset: wp.array2d[wp.float64]  # contacts: range of the gaps of the sample's cell [m], and
+    lead: wp.array2d[wp.float64]  # how much earlier than the sample its cell begins to touch [m]
     friction: wp.array2d[wp.float64]
     stick: wp.array2d[wp.float64]  # tangential stiffness of a contact with memory [N/m]; 0: smoothed Coulomb friction
     anchor: wp.array2d[wp.vec3d]  # where the sample stuck at the start of the step, in the shape's frame [m]
