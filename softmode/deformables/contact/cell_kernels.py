@@ -106,7 +106,8 @@ def lean_of(shape: CellShape, F: wp.mat33d, n: wp.vec3d):
 @wp.func
 def fade_of(shape: CellShape, F: wp.mat33d, n: wp.vec3d):
     """Return the range of the gap over which a neighbour counts as touching less and less [m]."""
-    return shape.fade + wp.sqrt(wp.length_sq(lean_of(shape, F, n)) + shape.bend * shape.bend)
+    ranges = wp.length_sq(lean_of(shape, F, n)) + shape.bend * shape.bend
+    return shape.fade + wp.sqrt(ranges + wp.float64(1.0e-24))  # which has a derivative at zero
 
 
 @wp.func

@@ -474,6 +474,16 @@ def accumulate_points(
     step.point[i, p] = -V * material.viscosity / dt * (F_start * hooke_stress(material, strain))
 
 
+@wp.func
+def turned_back(shapes: Shapes, shape: int, back: wp.vec3d, dt: float):
+    """Return (R - I)^T back of a shape that turns by R within the step: its drift grows so with the place."""
+    body = shapes.body[shape]
+    if body < 0:
+        return wp.vec3d()
+    spin = wp.float64(dt) * wp.vec3d(wp.spatial_bottom(shapes.body_qd[body]))
+    return wp.quat_rotate_inv(wp.quat_from_axis_angle(wp.normalize(spin), wp.length(spin)), back) - back
+
+
 @wp.kernel
 def accumulate_constraints(
     instances: Instances,
@@ -537,10 +547,7 @@ def accumulate_constraints(
     across = back - wp.dot(n, back) * n
     _origin, rotation = shape_frame(shapes, shape)
     step.memory_start[i, e] = -wp.quat_rotate_inv(rotation, across)
-    body = shapes.body[shape]
-    if body >= 0:
-        spin = wp.float64(dt) * wp.vec3d(wp.spatial_bottom(shapes.body_qd[body]))
-        across += wp.quat_rotate_inv(wp.quat_from_axis_angle(wp.normalize(spin), wp.length(spin)), back) - back
+    across += turned_back(shapes, shape, back, dt)
     step.constraint[i, e] = across
     # c = sqrt(friction of body * friction of shape)
     if instances.friction[i] > 0.0:

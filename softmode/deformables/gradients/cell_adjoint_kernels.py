@@ -33,7 +33,7 @@ from softmode.deformables.contact.penalty_kernels import (
     penalty,
     stiffness_exponents,
 )
-from softmode.deformables.gradients.adjoint_kernels import Linearised, Sums
+from softmode.deformables.gradients.adjoint_kernels import Linearised, Sums, turned_back
 from softmode.deformables.model.deformation_kernels import displacement_gradient
 from softmode.deformables.model.lane_kernels import vec8d
 from softmode.deformables.model.struct_kernels import (
@@ -153,6 +153,7 @@ def accumulate_cells(
         pulled = displacement_gradient(basis.row_gradient, costate, i, row, count)
         centre_bar = wp.transpose(pulled) * constraints.force[i, e] - wp.transpose(moved) * back
         centre_bar += along * (wp.transpose(ahead - start) * n)
+        centre_bar += wp.transpose(start) * turned_back(shapes, shape, back, dt)
     by_shape, by_F, _by_n, by_place, by_ratio, _o, _c = wp.grad(cell_loss)(
         cell_shape, ahead, n, gap, ratio, onset_bar, centre_bar
     )
