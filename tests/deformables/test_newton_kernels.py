@@ -213,16 +213,17 @@ def test_one_launch_on_cuda(shared: bool, rounds: int, room: int) -> None:
     np.testing.assert_allclose(at_once["force"], apart["force"], atol=1.0e-3 * np.abs(apart["force"]).max())
 
 
-SEARCH = ("search_kernels", ("check_iterates", "reuse_hessians"))
+EVALUATED = ("step_kernels", ("evaluate_constraints", "evaluate_points"))
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="needs the CUDA compiler of Warp's wheel")
 @pytest.mark.parametrize(
     ("module", "entries"),
     rest_but(
-        [SEARCH],
+        [EVALUATED],
         [
-            SEARCH,
+            EVALUATED,
+            ("search_kernels", ("check_iterates", "reuse_hessians")),
             ("assembly_kernels", ("assemble_matrix", "assemble_columns", "assemble_pins")),
             ("tile_kernels", ("assemble_tiles",)),
             ("newton_round_kernels", ("evaluate_trials", "differentiate_points", "assemble_stiffness")),

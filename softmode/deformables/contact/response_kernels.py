@@ -1,9 +1,6 @@
 """Device side of a pin and of a contact: energy, force and Hessian at a displacement, and the friction's normal force.
 
-The code that takes eight on a CPU is written from these functions. CUDA and pairs of soft bodies take one at a time by
-``step_kernels.evaluate_constraint``, which shares ``penalty_kernels`` with them; `test_cpu_kernels.py` compares. Called
-from there and from the rigid start, :func:`contact_response` cost a third of the rate of 4,096 worlds on one H200
-(105,722 -> 71,261 steps per second in grasps).
+CUDA takes one at a time; the code that takes eight on a CPU is written from these functions.
 """
 
 import warp as wp

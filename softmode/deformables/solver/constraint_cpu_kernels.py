@@ -6,13 +6,13 @@ Their law is written from ``response_kernels``; ``test_cpu_kernels.py`` compares
 
 import warp as wp
 
-from softmode.deformables.contact.response_kernels import FIRST, KEEP, RELAX, SET, contact_response
+from softmode.deformables.contact.response_kernels import KEEP, contact_response
 from softmode.deformables.model.declare import kernel_over
 from softmode.deformables.model.interpolation_cpu_kernels import SUMS
 from softmode.deformables.model.lane_kernels import LANES, vec8, vec8d
 from softmode.deformables.model.struct_kernels import PointConstraints
 from softmode.deformables.solver.iteration_kernels import NewtonStep
-from softmode.deformables.solver.step_kernels import RELAXED_AFTER, evaluate_constraint
+from softmode.deformables.solver.step_kernels import evaluate_constraint, normal_force_mode
 from softmode.lanes import lanes_code
 
 wp.set_module_options({"enable_backward": False})
@@ -140,19 +140,6 @@ def evaluate_eight_constraints(
 
 
 @wp.func
-def normal_force_mode(step: NewtonStep, derivatives: int, w: int):
-    """Return what becomes of the normal force that friction goes by, see ``response_kernels.KEEP``."""
-    iteration = step.state.iteration[w]
-    if derivatives == 0 or iteration > step.state.friction_lag:
-        return int(KEEP)
-    if iteration == 0:
-        return int(FIRST)
-    if iteration > RELAXED_AFTER:
-        return int(RELAX)
-    return int(SET)
-
-
-@wp.func
 def evaluate_constraints_of(
     step: NewtonStep,
     # State in:
@@ -168,7 +155,7 @@ def evaluate_constraints_of(
         return
     count = step.constraints.count[i]
     alone = count - step.constraints.pair_count[i]
-    mode = normal_force_mode(step, derivatives, w)
+    mode = normal_force_mode(step.state.iteration[w], step.state.friction_lag, derivatives)
     known = int(0)
     if derivatives != 0 and step.state.evaluated[w] != 0:
         known = 1

@@ -58,7 +58,9 @@ TEAMS = 672
 ALWAYS = 5
 """Rounds that are taken however few worlds are left."""
 BESIDE = 2
-"""Most worlds for each multiprocessor that go their whole way beside the rounds."""
+"""Most worlds for each multiprocessor that go their whole way beside the rounds.
+
+Without them 4,096 worlds of random actions lose 12 % (plush) and 16 % (beam) on one H200, and grasps gain 2 to 4 %."""
 LEVELS = 16
 """Numbers of iterations that are told apart where worlds are ordered by what is expected of them."""
 FEWEST = wp.constant(2)

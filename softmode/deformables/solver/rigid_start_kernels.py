@@ -12,7 +12,8 @@ from typing import Any
 
 import warp as wp
 
-from softmode.deformables.contact.penalty_kernels import contact_potential, slip_potential
+from softmode.deformables.contact.penalty_kernels import contact_potential
+from softmode.deformables.contact.response_kernels import KEEP, SET, contact_response
 from softmode.deformables.model.lane_kernels import team_sum, team_sum3, team_sum33, vec8d
 from softmode.deformables.model.struct_kernels import (
     Instances,
@@ -123,17 +124,26 @@ def contact_at(
     follow: int,
 ):
     """Return energy, force and Hessian of a contact at offset + d; ``follow``: its friction takes this normal force."""
-    n = constraints.normal[i, e]
-    k = constraints.stiffness[i, e]
-    psi, slope, curvature = contact_potential(constraints, -wp.dot(n, total), i, e)
+    mode = wp.where(follow != 0, int(SET), int(KEEP))
+    energy, force, H, pressed, _slip = contact_response(
+        False,
+        total,
+        constraints.normal[i, e],
+        wp.vec3d(),
+        constraints.stiffness[i, e],
+        constraints.dent_compliance[i, e],
+        constraints.dent_depth[i, e],
+        constraints.friction[i, e],
+        constraints.stick[i, e],
+        constraints.normal_force[i, e],
+        constraints.onset[i, e],
+        stick_range,
+        mode,
+        0,
+    )
     if follow != 0:
-        constraints.normal_force[i, e] = k * slope
-    limit = constraints.friction[i, e] * constraints.normal_force[i, e]
-    t = total - wp.dot(n, total) * n
-    f0, secant, _tangent = slip_potential(wp.length(t), limit, constraints.stick[i, e], stick_range)
-    N = wp.outer(n, n)
-    H = k * curvature * N + secant * (wp.identity(n=3, dtype=wp.float64) - N)
-    return k * psi + f0, k * slope * n - secant * t, H
+        constraints.normal_force[i, e] = pressed
+    return energy, force, H
 
 
 @wp.func

@@ -22,7 +22,7 @@ from typing import Any
 
 import warp as wp
 
-from softmode.deformables.contact.penalty_kernels import contact_potential, slip_potential
+from softmode.deformables.contact.response_kernels import FIRST, KEEP, RELAX, SET, contact_response
 from softmode.deformables.materials.hessian_kernels import hessian
 from softmode.deformables.materials.material_kernels import (
     MaterialModel,
@@ -406,6 +406,21 @@ evaluate_points = kernel_over(evaluate_point, "evaluate_points", "i", "p", "lane
 
 
 @wp.func
+def normal_force_mode(iteration: int, lag: int, derivatives: int):
+    """Return what becomes of the normal force that friction goes by, see ``response_kernels.KEEP``.
+
+    Not of the step's struct, 8 kB, which each thread on CUDA would copy: that cost a third of a step.
+    """
+    if derivatives == 0 or iteration > lag:
+        return int(KEEP)
+    if iteration == 0:
+        return int(FIRST)
+    if iteration > RELAXED_AFTER:
+        return int(RELAX)
+    return int(SET)
+
+
+@wp.func
 def evaluate_constraint(
     step: NewtonStep,
     # State in:
@@ -447,46 +462,30 @@ def evaluate_constraint(
         for k in range(step.constraints.dof_begin[i, e], step.constraints.dof_end[i, e]):
             d -= r[w, k] * wp.vec3d(step.constraints.jacobian[i, e, k])
         step.constraints.displacement[i, e] = d
-    stiffness = step.constraints.stiffness[i, e]
-    identity = wp.identity(n=3, dtype=wp.float64)
-    H = stiffness * identity
-    if e < step.instances.pin_count[i]:
-        x = step.constraints.offset[i, e] + d
-        step.constraints.energy[i, e] = wp.float64(0.5) * stiffness * wp.length_sq(x)
-        step.constraints.force[i, e] = -stiffness * x
-    else:
-        n = step.constraints.normal[i, e]
-        total = step.constraints.offset[i, e] + d
-        psi, slope, curvature = contact_potential(step.constraints, -wp.dot(n, total), i, e)
-        if derivatives != 0 and step.state.iteration[w] <= step.state.friction_lag:
-            held = slope
-            if step.state.iteration[w] == 0:
-                # in an impact the first guess lies far too deep: friction of such a force would be too stiff to solve
-                gap = wp.min(wp.dot(n, step.constraints.offset[i, e]), wp.float64(0.0))
-                deep = step.constraints.onset[i, e] - wp.float64(2.0) * gap
-                _psi, most, _curvature = contact_potential(step.constraints, deep, i, e)
-                held = wp.min(slope, most)
-            pressed = stiffness * held
-            if step.state.iteration[w] > RELAXED_AFTER:
-                # the fixed point between normal force and friction may be repelling: a mean of two iterates is not
-                pressed = wp.float64(0.5) * (pressed + step.constraints.normal_force[i, e])
+    mode = normal_force_mode(step.state.iteration[w], step.state.friction_lag, derivatives)
+    pinned = e < step.instances.pin_count[i]
+    energy, force, H, pressed, slip = contact_response(
+        pinned,
+        step.constraints.offset[i, e],
+        step.constraints.normal[i, e],
+        d,
+        step.constraints.stiffness[i, e],
+        step.constraints.dent_compliance[i, e],
+        step.constraints.dent_depth[i, e],
+        step.constraints.friction[i, e],
+        step.constraints.stick[i, e],
+        step.constraints.normal_force[i, e],
+        step.constraints.onset[i, e],
+        step.options.stick_range,
+        mode,
+        step.state.exact[w],
+    )
+    step.constraints.energy[i, e] = share * energy
+    step.constraints.force[i, e] = force
+    if not pinned:
+        step.constraints.slip[i, e] = slip
+        if mode != int(KEEP):
             step.constraints.normal_force[i, e] = pressed
-        normal_force = step.constraints.normal_force[i, e]
-        # offset = gap n + memory - drift of the shape: the tangential part is the slip
-        t = total - wp.dot(n, total) * n
-        y = wp.length(t)
-        limit = step.constraints.friction[i, e] * normal_force
-        stick = step.constraints.stick[i, e]
-        f0, secant, tangent = slip_potential(y, limit, stick, step.options.stick_range)
-        step.constraints.slip[i, e] = t
-        step.constraints.energy[i, e] = share * (stiffness * psi + f0)
-        step.constraints.force[i, e] = stiffness * slope * n - secant * t
-        # f0 is concave in y^2, so the quadratic of the secant's curvature lies above it and its steps cannot overshoot,
-        # from however far away; the potential's own curvature along the slip converges faster once the state is close
-        N = wp.outer(n, n)
-        H = stiffness * curvature * N + secant * (identity - N)
-        if step.state.exact[w] != 0 and y > wp.float64(1.0e-9) * step.options.stick_range:
-            H += (tangent - secant) / (y * y) * wp.outer(t, t)
     if derivatives != 0:
         step.constraints.hessian[i, e] = wp.mat33(H)
         for k in range(step.constraints.dof_begin[i, e], step.constraints.dof_end[i, e]):
