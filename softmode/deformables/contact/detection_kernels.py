@@ -569,7 +569,11 @@ def gather_contacts(
         kappa = stiffness_per_area(instances, i, BULK_FACTOR, firm, partner_mass, partner_area, dt)
         stiffness = wp.float64(kappa * area)
         compliance = wp.float64(spared * dent_compliance(instances, i, relative, surface.dent_length[row]) / area)
-        cell = cell_at(cell_shape, ahead, normal, gap + closing, stiffness * compliance)
+        share = float(1.0)
+        if partner_mass > 0.0:  # what is light beside the body turns faster than its cells, which lag by a step
+            share = partner_mass / (partner_mass + float(instances.mass[i]))
+        ratio = stiffness * compliance * wp.float64(share * share)
+        cell = cell_at(cell_shape, ahead, normal, gap + closing, ratio)
         turned = wp.dot(normal, (ahead - start) * cell.centre)
         # both bodies feel the force at one point, not the shape at its own surface: a pair of forces on two
         # points would make angular momentum out of friction times penetration
