@@ -111,20 +111,23 @@ def fade_of(shape: CellShape, F: wp.mat33d, n: wp.vec3d):
 
 
 @wp.func
-def cell_at(shape: CellShape, F: wp.mat33d, n: wp.vec3d, gap: wp.float64, ratio: wp.float64):
-    """Return a cell where its sample has a gap [m], and its dent ``ratio`` times the compliance of the penalty.
+def cell_at(shape: CellShape, F: wp.mat33d, n: wp.vec3d, gap: wp.float64, closing: wp.float64, ratio: wp.float64):
+    """Return a cell whose sample has a gap [m], ``closing`` [m] more ahead, and a dent of ``ratio`` penalties.
 
     The cell turns with the dent: where there is none and the penalty alone keeps surfaces apart, so stiff a centre of
-    pressure would move the body to and fro.
+    pressure would move the body to and fro. What begins a step farther away than any cell reaches is level: it may pass
+    what it would lean against.
     """
     half = wp.float64(0.5)
     zero = wp.float64(0.0)
     lean = ratio / (wp.float64(1.0) + ratio) * lean_of(shape, F, n)
+    if gap > half * shape.steepest:
+        lean = wp.vec3d()
     tilt = wp.length(lean)
     cell = Cell()
     cell.onset = wp.sqrt(shape.least * shape.least + shape.bend * shape.bend + tilt * tilt)
     if tilt > LEVEL * shape.least:
-        p = -(gap + half * shape.bend)
+        p = -(gap + closing + half * shape.bend)
         q = p + half * cell.onset
         at = half * shape.width
         if q > cell.onset:

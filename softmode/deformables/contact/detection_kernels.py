@@ -227,13 +227,14 @@ def march(
     end: float,
     back: int,
     thick: float,
+    onset: float,
     reach: float,
 ):
     """Return gap and normal of the half-space that stands for a shape along a way from ``x``, in the shape's frame.
 
     The way is marched by distances to the shape grown by ``thick``. To the body's inside (``back``), for a sample past
     the middle of a thin plate or through it: where the way leaves the shape, else what is ``nearest`` to x. The way of
-    a fast sample: where it first meets the shape, or else passes nearest.
+    a fast sample: where it first meets the shape, or else passes nearest, with no ``onset`` of its contact.
     """
     kind = shapes.kind[shape]
     scale = shapes.scale[shape]
@@ -273,7 +274,7 @@ def march(
     slope = wp.dot(out.normal, along)
     out.distance -= out_at * slope
     if back == 0 and not inside:
-        out.distance = wp.max(out.distance, -end * slope)  # a way that misses the shape misses its half-space
+        out.distance = wp.max(out.distance, onset - end * slope)  # a way that misses the shape misses its half-space
     return out
 
 
@@ -354,7 +355,7 @@ def find_contacts(
             along = wp.quat_rotate_inv(turn, drift) / travel
             end = travel
         if end > 0.0:
-            query = march(shapes, shape, local, query, along, end, back, thick, far)
+            query = march(shapes, shape, local, query, along, end, back, thick, instances.smoothing[i], far)
         gap = wp.float64(query.distance)
         if gap < wp.float64(reach) and gap < samples.gap[i, s, 1]:
             normal = wp.quat_rotate(turn, query.normal)
@@ -573,7 +574,7 @@ def gather_contacts(
         if partner_mass > 0.0:  # what is light beside the body turns faster than its cells, which lag by a step
             share = partner_mass / (partner_mass + float(instances.mass[i]))
         ratio = stiffness * compliance * wp.float64(share * share)
-        cell = cell_at(cell_shape, ahead, normal, gap + closing, ratio)
+        cell = cell_at(cell_shape, ahead, normal, gap, closing, ratio)
         turned = wp.dot(normal, (ahead - start) * cell.centre)
         # both bodies feel the force at one point, not the shape at its own surface: a pair of forces on two
         # points would make angular momentum out of friction times penetration

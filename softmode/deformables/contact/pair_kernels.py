@@ -537,7 +537,7 @@ def write_pairs(
     wi = wp.float64(spared_i * dent_compliance(instances, i, ri, surface.dent_length[own]) / half_area)
     wj = wp.float64(spared_j * dent_compliance(instances, j, rj, surface.dent_length[at]) / half_area)
     compliance = wi + wj
-    cell = cell_at(mine, F_own, n, pairs.gap[i, s, slot], stiffness * compliance)
+    cell = cell_at(mine, F_own, n, pairs.gap[i, s, slot], wp.float64(0.0), stiffness * compliance)
     stick = stick_ratio * shear
     stick = stick / (wp.float64(1.0) + stick * (shear_yield(instances, i, wi) + shear_yield(instances, j, wj)))
     pairs.share[i, s, slot] = float(wi / wp.max(compliance, wp.float64(1.0e-30)))

@@ -66,12 +66,13 @@ def cell_loss(
     F: wp.mat33d,
     n: wp.vec3d,
     gap: wp.float64,
+    closing: wp.float64,
     ratio: wp.float64,
     onset_bar: wp.float64,
     centre_bar: wp.vec3d,
 ):
     """Return the loss to first order in what ``cell_at`` returns."""
-    cell = cell_at(shape, F, n, gap, ratio)
+    cell = cell_at(shape, F, n, gap, closing, ratio)
     return onset_bar * cell.onset + wp.dot(centre_bar, cell.centre)
 
 
@@ -142,7 +143,7 @@ def accumulate_cells(
     ahead, closing = ahead_of(instances, basis, motion, start, n, i, row, dt)
     x = wp.vec3(samples.position[i, row - instances.row_start[i]])
     closing -= wp.dot(n, wp.vec3d(shape_drift(shapes, shape, x, dt)))
-    gap = gap_of(instances, samples, i, row, shape) + closing
+    gap = gap_of(instances, samples, i, row, shape)
     other = curvature_of(shapes, shape, n)
     cell_shape = shape_of_cell(surface, instances, basis, i, row, other)
     back = step.contact_bar[i, e]
@@ -154,11 +155,11 @@ def accumulate_cells(
         centre_bar = wp.transpose(pulled) * constraints.force[i, e] - wp.transpose(moved) * back
         centre_bar += along * (wp.transpose(ahead - start) * n)
         centre_bar += wp.transpose(start) * turned_back(shapes, shape, back, dt)
-    by_shape, by_F, _by_n, by_place, by_ratio, _o, _c = wp.grad(cell_loss)(
-        cell_shape, ahead, n, gap, ratio, onset_bar, centre_bar
+    by_shape, by_F, _by_n, _by_gap, by_place, by_ratio, _o, _c = wp.grad(cell_loss)(
+        cell_shape, ahead, n, gap, closing, ratio, onset_bar, centre_bar
     )
     fade_shape, fade_F, _fade_n = wp.grad(fade_of)(cell_shape, ahead, n)
-    cell = cell_at(cell_shape, ahead, n, gap, ratio)
+    cell = cell_at(cell_shape, ahead, n, gap, closing, ratio)
     fade = fade_of(cell_shape, ahead, n)
     spared = spared_share(surface, samples.shape, samples.gap, cell_shape, fade, i, row, shape)
     by_gap = zero
@@ -222,7 +223,7 @@ def restore_rows(
     closing -= wp.dot(n, wp.vec3d(shape_drift(shapes, shape, x, dt)))
     cell_shape = shape_of_cell(surface, instances, basis, i, row, curvature_of(shapes, shape, n))
     ratio = constraints.stiffness[i, e] * constraints.dent_compliance[i, e]
-    cell = cell_at(cell_shape, ahead, n, gap_of(instances, samples, i, row, shape) + closing, ratio)
+    cell = cell_at(cell_shape, ahead, n, gap_of(instances, samples, i, row, shape), closing, ratio)
     write_row(basis, constraints.row[i, e], row, cell.centre)
 
 
