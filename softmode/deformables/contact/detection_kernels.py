@@ -606,9 +606,8 @@ def gather_contacts(
             prescribed,
         )
         # d enters as offset + displacement, with the gap along the normal and the shape's own motion taken off
-        lead = wp.float64(0.5) * (cell.onset - cell_shape.bend)
-        constraints.offset[i, e] = (gap - turned - lead) * normal + slip - wp.vec3d(drift)
-        constraints.lead[i, e] = lead
+        constraints.offset[i, e] = (gap - turned - cell.lead) * normal + slip - wp.vec3d(drift)
+        constraints.lead[i, e] = cell.lead
         constraints.onset[i, e] = cell.onset
         constraints.anchor[i, e] = anchor
         stick = stick_ratio * wp.float64(shear * area)

@@ -549,8 +549,7 @@ def write_pairs(
     deepest = -wp.float64(OVERLAP * wp.min(instances.size[i], instances.size[j]))
     if pairs.gap[i, s, slot] < deepest:
         wp.atomic_or(state.status, instances.world[i], WORLD_PENETRATION)
-    lead = wp.float64(0.5) * (cell.onset - mine.bend)
-    offset = (wp.max(pairs.gap[i, s, slot], deepest) - lead) * n
+    offset = (wp.max(pairs.gap[i, s, slot], deepest) - cell.lead) * n
     particle = instances.particle_start[i] + s
     for before in range(SLOTS):
         if stick_partner[particle][before] == j - state.instance_start[instances.world[i]]:
@@ -580,7 +579,7 @@ def write_pairs(
             constraints.dent_compliance[a, e] = compliance
             constraints.dent_depth[a, e] = wp.float64(depth)
             constraints.onset[a, e] = cell.onset
-            constraints.lead[a, e] = lead
+            constraints.lead[a, e] = cell.lead
             constraints.friction[a, e] = friction
 
 

@@ -69,11 +69,12 @@ def cell_loss(
     closing: wp.float64,
     ratio: wp.float64,
     onset_bar: wp.float64,
+    lead_bar: wp.float64,
     centre_bar: wp.vec3d,
 ):
     """Return the loss to first order in what ``cell_at`` returns."""
     cell = cell_at(shape, F, n, gap, closing, ratio)
-    return onset_bar * cell.onset + wp.dot(centre_bar, cell.centre)
+    return onset_bar * cell.onset + lead_bar * cell.lead + wp.dot(centre_bar, cell.centre)
 
 
 @wp.func
@@ -133,10 +134,10 @@ def accumulate_cells(
     _psi, _slope, curvature = penalty(p, eps)
     _deep_psi, _deep_slope, deep_curvature = penalty(p - depth - deep, deep)
     steep = HARDENING * deep_curvature
-    total_curvature = share * curvature + steep
     force_bar = k * step.normal_bar[i, e][0]
-    onset_bar = share * by_onset(p, eps) + HARDENING_DEPTH * (HARDENING * by_onset(p - depth - deep, deep) - steep)
-    onset_bar = force_bar * (onset_bar + half * total_curvature)
+    onset_bar = HARDENING_DEPTH * (HARDENING * by_onset(p - depth - deep, deep) - steep)
+    onset_bar = force_bar * (onset_bar + share * by_onset(p, eps))
+    lead_bar = force_bar * (share * curvature + steep)
     depth_bar = -force_bar * steep * depth
 
     start = gradient_of(instances, basis, motion.q_start, i, row)
@@ -155,8 +156,8 @@ def accumulate_cells(
         centre_bar = wp.transpose(pulled) * constraints.force[i, e] - wp.transpose(moved) * back
         centre_bar += along * (wp.transpose(ahead - start) * n)
         centre_bar += wp.transpose(start) * turned_back(shapes, shape, back, dt)
-    by_shape, by_F, _by_n, _by_gap, by_place, by_ratio, _o, _c = wp.grad(cell_loss)(
-        cell_shape, ahead, n, gap, closing, ratio, onset_bar, centre_bar
+    by_shape, by_F, _by_n, _by_gap, by_place, by_ratio, _o, _l, _c = wp.grad(cell_loss)(
+        cell_shape, ahead, n, gap, closing, ratio, onset_bar, lead_bar, centre_bar
     )
     fade_shape, fade_F, _fade_n = wp.grad(fade_of)(cell_shape, ahead, n)
     cell = cell_at(cell_shape, ahead, n, gap, closing, ratio)
@@ -184,7 +185,7 @@ def accumulate_cells(
 
     # lengths grow with the scale, but not the radius of what is touched
     touched = half * spared_bar * by_gap
-    bend_bar = by_shape.bend + fade_bar * fade_shape.bend + touched - half * force_bar * total_curvature
+    bend_bar = by_shape.bend + fade_bar * fade_shape.bend + touched
     area = wp.float64(instances.scale[i] * instances.scale[i] * basis.row_area[row])
     by_scale = depth_bar + fade_bar * fade_shape.fade * cell_shape.fade
     by_scale += (by_shape.steepest + fade_bar * fade_shape.steepest) * cell_shape.steepest

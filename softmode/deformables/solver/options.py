@@ -54,7 +54,7 @@ class SolverReducedOptions:
     """Detection distance as a fraction of the body size, on top of twice the motion of the step."""
     soft_contact: bool = True
     """Whether soft bodies touch each other, and themselves where ``self_contact`` says so."""
-    contact_smoothing: float = 2.0e-4
+    contact_smoothing: float = 8.0e-4
     """Range of the onset of the contact of a level face as a fraction of the body size, or of three times its thickness
     where that is less. That of a tilted or curved one is the range of the gaps of its sample's cell."""
     stick_ratio: float = 1.0
