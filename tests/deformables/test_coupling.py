@@ -211,7 +211,7 @@ def test_eccentric_impact(ratio):
 
     L_(n+1) - L_n = -dt^2 sum_k v_k cross f_k(q_(n+1)) in a step, of first order in dt, as in the decay of a free spin:
     bounded by omega dt of the angular momentum passed on. The levers of a step are those of its start, the shape moves
-    on by less than v dt before it turns back: twice v dt of the momentum passed on.
+    on by less than v dt: another v dt of the momentum passed on.
     """
     scene, twin = impact(ratio, offset=(0.03, 0.02))
     p0, L0, e0 = totals(scene, twin)
@@ -224,7 +224,7 @@ def test_eccentric_impact(ratio):
         assert e <= (1.0 + 1e-6) * e0
     omega = max(soft) / (scene.mass() * EDGE**2 / 6.0)
     assert max(soft) > 0.05 * np.linalg.norm(L0) or ratio != 1.0
-    lever = 1.1 * scene.dt * np.linalg.norm(scene.momentum()[0])
+    lever = 0.5 * scene.dt * np.linalg.norm(scene.momentum()[0])
     assert np.linalg.norm(L - L0) <= 1e-4 * np.linalg.norm(L0) + omega * scene.dt * max(soft) + lever
 
 
@@ -364,8 +364,8 @@ def test_squeeze_equals_drive(youngs_modulus, dt):
     weight = scene.mass() * GRAVITY
     assert abs(hold[:, 0].mean() - hold[:, 1].mean()) <= 1e-2 * hold[:, 0].mean()
     assert -hold[:, 2].mean() == pytest.approx(weight, rel=1e-2)
-    # It rises with the palm, less what it shears where it is held.
-    assert hold[-1, 5] - height == pytest.approx(hold[-1, 6], abs=1.2e-3)
+    # It rises with the palm.
+    assert hold[-1, 5] - height == pytest.approx(hold[-1, 6], abs=1e-3)
     assert not status & (bits.WORLD_NOT_FINITE | bits.WORLD_CONTACT_OVERFLOW)
 
 
