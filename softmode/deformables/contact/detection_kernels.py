@@ -274,7 +274,9 @@ def march(
     slope = wp.dot(out.normal, along)
     out.distance -= out_at * slope
     if back == 0 and not inside:
-        out.distance = wp.max(out.distance, onset - end * slope)  # a way that misses the shape misses its half-space
+        # a way that misses the shape misses its half-space, and where it begins outside of the onset that too
+        clear = wp.where(nearest.distance > onset, onset, 0.0)
+        out.distance = wp.max(out.distance, clear - end * slope)
     return out
 
 
