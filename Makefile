@@ -107,9 +107,9 @@ smoke: dist  ## install the wheel alone into a new environment, make an environm
 	$(BIN)/python -m pytest -m 'not slow' tests/test_packaging.py $(ARGS)
 
 bench: $(VENV)/.demo  ## time the build, a step and each stage of a grasp
-	$(BIN)/python benchmarks/build.py
+	$(BIN)/python -m benchmarks.build
 	$(BIN)/python benchmarks/step.py --stages $(ARGS)
-	$(BIN)/python benchmarks/grasp.py
+	$(BIN)/python benchmarks/grasp_phases.py
 
 $(VENV)/.bench: $(VENV)/.dev
 	$(INSTALL) --editable '.[bench]' || $(BIN)/python -m pip install --quiet -c constraints.txt --editable '.[bench]'

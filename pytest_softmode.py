@@ -75,9 +75,13 @@ def softmode_env() -> Iterator[Callable[..., gym.Env]]:
 
     def make(env: str, **config: Any) -> gym.Env:
         """Return an environment."""
+        import gymnasium as gym
+
+        import softmode  # noqa: F401  (registers the environments)
+
         key = repr((env, sorted(config.items())))
         if key not in made:
-            made[key] = _made(env, config)
+            made[key] = gym.make(env, **config)
         return made[key]
 
     yield make
@@ -153,26 +157,6 @@ def _short_names() -> types.ModuleType:
     plugin = types.ModuleType(_SHORT)
     vars(plugin).update(soft_env=soft_env, episode=episode, golden=golden)
     return plugin
-
-
-def _made(env: str, given: dict[str, Any]) -> gym.Env:
-    """Make an environment from options of its class and fields of its configuration."""
-    import dataclasses
-
-    import gymnasium as gym
-
-    from softmode.envs.catalogue import config_class, env_class
-    from softmode.errors import ConfigError
-    from softmode.learning.config_values import split_config
-
-    names = {item.name for item in dataclasses.fields(config_class(env))}
-    options = {*inspect.signature(env_class(env).__init__).parameters, "max_episode_steps"} - {"self"}
-    if unknown := sorted(set(given) - names - options):
-        hint = f"give one of {', '.join(sorted(names | options))}"
-        raise ConfigError(f"{env} has neither an option nor a field {unknown[0]!r}", hint=hint)
-    fields = {name: value for name, value in given.items() if name in names}
-    config, rest = split_config(env, {name: value for name, value in given.items() if name not in names})
-    return gym.make(env, config=dataclasses.replace(config, **fields), **rest)
 
 
 # -- the marker -------------------------------------------------------------------------------------------------------

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -28,7 +27,6 @@ from benchmarks.camera_scene import DILATION, SceneCamera, blob, handle_scene, i
 from benchmarks.clock import Clock
 from benchmarks.step import product_rate
 from softmode.splats.rasterizer_kernels import TILE
-from softmode.splats.threaded_rasterizer import ThreadedRasterizer
 from tests.splats.dense_reference import render_dense
 
 TOLERANCE = 1e-5
@@ -54,8 +52,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     wp.config.log_level = wp.LOG_WARNING
     sound = all([check(size, options.splats, options.device) for size in options.sizes])
     report_throughput(options)
-    if options.device == "cpu":
-        report_threads(options)
     if options.peer == "newton":
         clock = Clock(options.device, options.repeats)
         from benchmarks.camera_quality import report_quality, report_speed
@@ -136,42 +132,6 @@ def stages(camera: SceneCamera) -> list[Callable[[], None]]:
         raster._cover_tiles,
         lambda: raster._blend(splats, views, None, None),
     ]
-
-
-def report_threads(options: argparse.Namespace) -> None:
-    """Print the wall time of several views drawn by one thread and by one thread per core, one graph each."""
-    print("  px  views | wall ms: one thread, threads  x  (least of the repeats, no deformation)")
-    for size in options.sizes:
-        for worlds in options.worlds:
-            if worlds == 1:
-                continue
-            camera = SceneCamera(handle_scene(blob(options.splats), worlds), size, device="cpu")
-            camera.frame()
-            raster = camera.rasterizer
-            walls, pictures = [], []
-            for threads in (1, None):
-                threaded = ThreadedRasterizer(
-                    raster.splat_count, worlds, size, size, options=raster.options, threads=threads
-                )
-                replay = threaded.capture(camera.splats, camera.views)
-                walls.append(least_wall(replay, options.repeats))
-                pictures.append(threaded.rgb.numpy())
-            same = all(np.array_equal(picture, raster.rgb.numpy()) for picture in pictures)
-            print(
-                f"{size:4d} {worlds:6d} | {walls[0]:8.2f} {walls[1]:8.2f} {walls[0] / walls[1]:5.2f}  "
-                f"{'same bits' if same else 'PICTURES DIFFER'}",
-                flush=True,
-            )
-
-
-def least_wall(run: Callable[[], None], repeats: int) -> float:
-    """Return the least wall time of a call [ms]: of several threads no other clock tells the speed."""
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        run()
-        times.append(1e3 * (time.perf_counter() - start))
-    return min(times)
 
 
 def least_work(camera: SceneCamera) -> tuple[float, float]:

@@ -1,8 +1,8 @@
 """Two-way coupling of soft cubes and rigid bodies, side by side in one run.
 
 Run: ``python -m benchmarks.coupling [--quick] [--schemes joint ...]`` from the repository root. Prints one markdown
-table: the joint solve, Newton's SolverCoupledProxy with one and three lagged passes around the same reduced solver, and
-the same coupler around Newton's SolverVBD on tetrahedra. One core, no GPU; times are processor times of this process.
+table: the joint solve, and Newton's SolverCoupledProxy with one and three lagged passes around its SolverVBD on
+tetrahedra. One core, no GPU; times are processor times of this process.
 """
 
 from __future__ import annotations

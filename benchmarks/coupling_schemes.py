@@ -1,4 +1,4 @@
-"""The same scenes of rigid bodies and soft cubes under four couplings, with what the benchmark measures of them."""
+"""The same scenes of rigid bodies and soft cubes under three couplings, with what the benchmark measures of them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from newton.solvers import SolverMuJoCo, SolverVBD
 from newton.solvers.experimental.coupled import SolverCoupledProxy  # pyright: ignore[reportMissingImports]
 
 from softmode.deformables.body.reduced_body import ReducedBody
-from softmode.deformables.coupling.proxy import SolverReducedProxy
 from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body, register_custom_attributes
@@ -22,10 +21,9 @@ from tests import reference
 from tests.bodies import cube
 from tests.scenes import rotation
 
-SchemeName = Literal["joint", "proxy x1", "proxy x3", "VBD x1", "VBD x3"]
-SCHEMES: tuple[SchemeName, ...] = ("joint", "proxy x1", "proxy x3", "VBD x1", "VBD x3")
-"""The joint solve; Newton's SolverCoupledProxy with one and three lagged passes around the same reduced solver; the
-same coupler around Newton's SolverVBD on tetrahedra."""
+SchemeName = Literal["joint", "VBD x1", "VBD x3"]
+SCHEMES: tuple[SchemeName, ...] = ("joint", "VBD x1", "VBD x3")
+"""The joint solve; Newton's SolverCoupledProxy with one and three lagged passes around its SolverVBD on tetrahedra."""
 
 VBD_CELLS = 4
 """Cells of the tetrahedral cube along an edge, five tetrahedra each."""
@@ -77,7 +75,7 @@ class Coupled:
         ground: float | None = None,
     ) -> None:
         """Build model, solver and graph."""
-        self.scheme, self.worlds, self.dt, self.ground = scheme, worlds, dt, ground
+        self.worlds, self.dt, self.ground = worlds, dt, ground
         self.vbd = scheme.startswith("VBD")
         self.body: ReducedBody = cube(worlds[0].soft.edge)
         self.model: Any = self._build(gravity)
@@ -90,8 +88,6 @@ class Coupled:
         else:
             self.solver = self._couple(int(scheme[-1]))
         self.control: Any = self.model.control()
-        if scheme.startswith("proxy"):
-            del self.control.softmode  # see SolverReducedProxy
         self.state: Any = self.model.state()
         self.other: Any = self.model.state()
         for state in (self.state, self.other):
@@ -152,39 +148,32 @@ class Coupled:
         proxy = functools.partial(
             SolverCoupledProxy.Proxy, source="rigid", destination="soft", bodies=self.touching, mode="lagged"
         )
-        if self.vbd:
-            soft = Entry("soft", _ReportingVBD, particles=particles)
-            pipe = functools.partial(
-                newton.CollisionPipeline,
-                broad_phase="explicit",
-                soft_contact_max=128 * len(self.worlds),
-                soft_contact_gap=0.01,
-                verify_buffers=False,
-            )
-            proxies = [proxy(collision_pipeline=pipe, collide_interval=1)]
-        else:
-            soft = Entry("soft", lambda view: SolverReducedProxy(view, [self.body]), particles=particles, in_place=True)
-            proxies = [proxy()]
+        soft = Entry("soft", _ReportingVBD, particles=particles)
+        pipe = functools.partial(
+            newton.CollisionPipeline,
+            broad_phase="explicit",
+            soft_contact_max=128 * len(self.worlds),
+            soft_contact_gap=0.01,
+            verify_buffers=False,
+        )
+        proxies = [proxy(collision_pipeline=pipe, collide_interval=1)]
         return SolverCoupledProxy(model, [rigid, soft], SolverCoupledProxy.Config(proxies, iterations=iterations))
 
     # -- what is measured ---------------------------------------------------------------------------------------------
 
     def contact_force(self) -> np.ndarray:
         """Return the soft contact force on every touching body [N], shape (world_count, touching, 3)."""
-        if self.scheme == "joint":
-            wrench = self.solver.body_wrench.numpy()[self.touching]
-        elif self.vbd:
+        if self.vbd:
             wrench = self.solver.solver("soft").harvested.numpy()[self.touching]
         else:
-            wrench = self.solver.solver("soft").body_wrench.numpy()
+            wrench = self.solver.body_wrench.numpy()[self.touching]
         return wrench[:, :3].reshape(len(self.worlds), -1, 3)
 
     def status(self) -> np.ndarray:
         """Return softmode's status bits per world, zero for others."""
         if self.vbd:
             return np.zeros(len(self.worlds), int)
-        soft = self.solver.reduced if self.scheme == "joint" else self.solver.solver("soft")
-        return soft.status.numpy()
+        return self.solver.reduced.status.numpy()
 
     def points(self) -> np.ndarray:
         """Return the particles, shape (world_count, particle_count, 3) [m]."""
@@ -198,7 +187,7 @@ class Coupled:
         if self.vbd:
             m, v = self.model.particle_mass.numpy().astype(float), self.state.particle_qd.numpy().astype(float)
             return p + m @ v, kinetic + 0.5 * m @ (v * v).sum(axis=1) + self._tetrahedral_energy()
-        data = (self.state if self.scheme == "joint" else self.solver.entry_state("soft")).softmode
+        data = self.state.softmode
         material = reference.with_float32(self.worlds[0].soft.material)
         twin = reference.FreeBody(body=self.body, material=material, dt=self.dt)
         mass, qd = material.density * self.body.volume, data.qd.numpy()

@@ -3,7 +3,7 @@
 Run: ``python benchmarks/grasp_phases.py --device cuda:0`` or, on one core, ``python benchmarks/grasp_phases.py``. Two
 versions of softmode compare with the same script: ``PYTHONPATH=<the other tree> python benchmarks/grasp_phases.py``.
 
-Protocol of ``benchmarks/envs.py --actions grasp``: LiftSoft with states, 4 steps of 1/120 s per control step;
+Protocol of ``softmode bench --actions grasp``: LiftSoft with states, 4 steps of 1/120 s per control step;
 ``--actions random`` for comparison. The rate is of replayed graphs, by the wall clock on CUDA and by processor time on
 CPU. Iterations are those of the last step of each control step. Kernels are then timed in control steps launched
 eagerly, by CUDA events or processor time, so their sum is more than a replayed step takes.

@@ -19,6 +19,7 @@ import numpy as np
 import warp as wp
 from scipy.spatial import KDTree
 
+from benchmarks.record import add_record_option, record
 from softmode.mpm import (
     MORPH_MATERIAL,
     MassLoss,
@@ -53,6 +54,7 @@ def main() -> None:
     parser.add_argument("--sources", nargs="+", help="only pairs that begin with these")
     parser.add_argument("--bodies", type=Path, help="particles of the pairs (.npz): read if it is there, else written")
     parser.add_argument("--json", type=Path, help="where to write the table")
+    add_record_option(parser)
     options = parser.parse_args()
     wp.config.log_level = wp.LOG_WARNING
     chosen = MorphOptions(
@@ -75,10 +77,16 @@ def main() -> None:
         return
     ball, goal = centred(filled([solid_of("sphere"), solid_of(options.target)], spacing=options.spacing)[1])
     print(f"{options.device}: ball of {ball.count} particles to {options.target} of {goal.count}")
-    time_step(ball, goal, chosen, options.device)
+    forward, backward = time_step(ball, goal, chosen, options.device)
+    measured: dict[str, float | str] = {"forward": forward, "backward": backward} if options.device == "cpu" else {}
     for worlds in options.worlds:
         for damping in options.damping:
-            time_morph(ball, goal, replace(chosen, mpm=replace(chosen.mpm, damping=damping)), options.device, worlds)
+            made = replace(chosen, mpm=replace(chosen.mpm, damping=damping))
+            seconds = time_morph(ball, goal, made, options.device, worlds)
+            if worlds == 1 and made == MorphOptions():
+                measured["core" if options.device == "cpu" else "h100"] = seconds
+    if options.record:
+        record("morph", measured, options.device)
 
 
 def centred(bodies: list[ParticleBody]) -> list[ParticleBody]:
@@ -158,8 +166,8 @@ def ejected(run: MorphRun, goal: ParticleBody) -> float:
     return float((KDTree(goal.positions).query(run.positions[-1])[0] > 1.0).mean())
 
 
-def time_step(ball: ParticleBody, goal: ParticleBody, options: MorphOptions, device: str) -> None:
-    """Print the time of a particle's step, forward and backward with the grid computed again."""
+def time_step(ball: ParticleBody, goal: ParticleBody, options: MorphOptions, device: str) -> tuple[float, float]:
+    """Print and return the time of a particle's step, forward and backward with the grid computed again."""
     simulation = MpmSimulation(ball, options.mpm, step_count=options.segment_length, device=device)
     loss = MassLoss(options.mpm.grid, goal, device=device)
     value = wp.zeros(1, dtype=wp.float64, device=device)
@@ -171,10 +179,11 @@ def time_step(ball: ParticleBody, goal: ParticleBody, options: MorphOptions, dev
     runs = (simulation.forward, lambda: loss.gradient(simulation))
     forward, backward = (1e6 * clock(run, device) / count for run in runs)
     print(f"a particle's step: forward {forward:.3f} us, backward {backward:.3f} us")
+    return forward, backward
 
 
-def time_morph(ball: ParticleBody, goal: ParticleBody, options: MorphOptions, device: str, worlds: int) -> None:
-    """Print time and accuracy of a morph, after one segment that compiles."""
+def time_morph(ball: ParticleBody, goal: ParticleBody, options: MorphOptions, device: str, worlds: int) -> float:
+    """Print time and accuracy of a morph, after one segment that compiles; return the time [s]."""
     MorphPlanner([ball] * worlds, goal, replace(options, frame_count=20), device=device).run()
     planner = MorphPlanner([ball] * worlds, goal, options, device=device)
     start = time.process_time() if device == "cpu" else time.perf_counter()
@@ -188,6 +197,7 @@ def time_morph(ball: ParticleBody, goal: ParticleBody, options: MorphOptions, de
         f"{100.0 * ejected(run, goal):.2f} % over a cell away, kinetic energy {run.kinetic_energy[-1]:.3g} J, "
         f"{1e-6 * bytes_of(planner):.1f} MB of arrays"
     )
+    return seconds
 
 
 def bytes_of(thing: object) -> int:

@@ -1,7 +1,7 @@
 """MuJoCo-Warp's own soft body in many worlds: the beam of LiftSoft as a cage of trilinear cells, held by two boxes.
 
 Run: ``python -m benchmarks.peers_flex [--device cuda:0] [--worlds 64 1024 4096]``. The rows stand beside those of
-``benchmarks/envs.py --preset beam --actions grasp`` and of MuJoCo-Warp with VBD in ``docs/performance.md``.
+``softmode bench --preset beam --actions grasp`` and of MuJoCo-Warp with VBD in ``benchmarks/JOURNAL.md``.
 
 Beam, material, table and steps are those of LiftSoft's preset "beam": 0.30 x 0.04 x 0.04 m, E = 2e5 Pa, nu = 0.3, four
 steps of 1/120 s per control step. The cage has one cell across and ten along, 44 nodes, 132 dofs, and the integrator is

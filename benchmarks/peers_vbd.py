@@ -1,7 +1,7 @@
 """MuJoCo-Warp with VBD in many worlds: LiftSoft's arm holds the beam, coupled by Newton's proxies.
 
 Run: ``python -m benchmarks.peers_vbd [--device cuda:0] [--worlds 64 1024 4096]``. The rows stand beside those of
-``benchmarks/envs.py --preset beam --actions grasp`` in ``docs/performance.md``.
+``softmode bench --preset beam --actions grasp`` in ``benchmarks/JOURNAL.md``.
 
 Arm, table, beam and material are those of LiftSoft's preset "beam": 0.30 x 0.04 x 0.04 m, E = 2e5 Pa, nu = 0.3. The
 physics has the settings of Isaac Lab's `Isaac-Lift-Soft-Franka`: steps of 1/120 s in two coupled substeps, four to a

@@ -25,6 +25,7 @@ import warp as wp
 
 from benchmarks.clock import Clock
 from benchmarks.grasp_phases import kernel_name
+from benchmarks.record import add_record_option, record
 from benchmarks.step import product_rate, report_torch
 from examples.swaying_plant import BUILD, RATE, STEPS, blow, make_plant, make_scene
 from softmode.deformables import BuildOptions
@@ -47,6 +48,7 @@ def main() -> None:
     parser.add_argument("--edge", type=int, default=256, help="edge of the picture [px]")
     parser.add_argument("--splats", type=int, default=14000, help="splats of the plant")
     parser.add_argument("--frames", type=int, default=60, help="pictures that are timed")
+    add_record_option(parser)
     given = parser.parse_args()
     wp.config.log_level = wp.LOG_WARNING
     if given.ranks:
@@ -85,6 +87,11 @@ def report(scene: Any, built: float, given: argparse.Namespace) -> None:
     print(f"a picture of {given.edge} px and {given.splats} splats {picture:.2f} ms, {1e3 / picture:.0f} a second")
     both = STEPS * step + picture
     print(f"two steps and a picture in turn {both:.1f} ms: {1e3 / both:.0f} pictures a second")
+    if given.record:
+        seconds = 1e-3 * step if scene.model.device.is_cpu else step
+        name = f"all_{'core' if scene.model.device.is_cpu else 'h200'}"
+        measured = {name: seconds} if given.all else {"steps": 1e3 / step, "pictures": 1e3 / picture}
+        record("plant", measured, given.device)
     constraints = int(scene.solver.tables.constraints.count.numpy().max())
     print(f"status {int(scene.solver.status.numpy().max())}, {constraints} constraints; each phase and a picture:")
     for name, run in stages(scene).items():

@@ -1,7 +1,7 @@
 """How far each phase of a step in a grasp is from the arithmetic, the traffic and the launches that it needs.
 
 Run: ``python -m benchmarks.roofline [--device cuda:0 --worlds 4096] [--preset beam]``. The table of
-``docs/performance.md`` is its output.
+``benchmarks/JOURNAL.md`` is its output.
 
 The object is held as in ``benchmarks/grasp_phases.py``. Each phase of Newton's iteration is launched by itself, in one
 eager control step, and timed; its flops and bytes per world follow from the sizes of the body, listed in `work`. The
@@ -21,8 +21,8 @@ import warp as wp
 
 from benchmarks.camera import copy_rate
 from benchmarks.clock import Clock
-from benchmarks.envs import add_object_options, configuration
-from benchmarks.grasp_phases import ENVIRONMENT, time_kernels
+from benchmarks.grasp_phases import time_kernels
+from benchmarks.scaling import ENVIRONMENT, add_object_options, task_configuration
 from benchmarks.step import product_rate
 from softmode.envs.throughput import _Source
 
@@ -56,7 +56,7 @@ def main() -> None:
     options = parser.parse_args()
     wp.config.log_level = wp.LOG_WARNING
     device = wp.get_device(options.device)
-    config = configuration(ENVIRONMENT, options)
+    config = task_configuration(options)
     output = "torch" if device.is_cuda else "numpy"
     env: Any = gym.make_vec(
         ENVIRONMENT, num_envs=options.worlds, device=options.device, config=config, obs_type="state", output=output

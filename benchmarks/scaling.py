@@ -1,8 +1,8 @@
 """Environment steps per second against worlds, functions, points, surface samples, bodies and devices, as tables.
 
 Run: ``python -m benchmarks.scaling [--device cuda:0] [--axes worlds functions points samples bodies]``, and
-``--axes devices --values 1 2 --worlds 4096`` for several GPUs of one host. The tables of ``docs/scaling.md`` are its
-output.
+``--axes devices --values 1 2 --worlds 4096`` for several GPUs of one host. The tables of
+``benchmarks/JOURNAL.md`` ("Scaling") are its output.
 
 LiftSoft with states, 4 steps of 1/120 s per control step, observations, rewards and resets included: with random
 actions, and with the fingers kept on the object ("grasp"). Young's modulus is drawn per world at each reset, and with
@@ -27,9 +27,10 @@ from typing import Any
 import gymnasium as gym
 import warp as wp
 
-from benchmarks import envs
 from benchmarks.clock import held
 from benchmarks.pile import pile
+from benchmarks.record import add_record_option, record
+from softmode.envs.catalogue import config_class
 from softmode.envs.reward_kernels import TOUCH_FORCE
 from softmode.envs.throughput import Actions, _Source
 
@@ -54,7 +55,8 @@ def main() -> None:
     parser.add_argument("--axes", nargs="+", choices=AXES, default=[axis for axis in AXES if axis != "devices"])
     parser.add_argument("--worlds", type=int, default=None, help="worlds of the other axes; default 1, on CUDA 1024")
     parser.add_argument("--values", type=int, nargs="+", default=None, help="values of the axis, if it is one")
-    envs.add_object_options(parser)
+    add_object_options(parser)
+    add_record_option(parser)
     parser.add_argument("--actions", nargs="+", choices=("random", "grasp"), default=["random", "grasp"])
     parser.add_argument("--steps", type=int, default=60)
     parser.add_argument("--warmup", type=int, default=60, help="control steps before the clock starts")
@@ -131,7 +133,7 @@ def play_part(worlds: int, options: argparse.Namespace, barrier: Any, results: A
     """Step the worlds of one device; put down when each kind of actions began and ended [s]."""
     wp.config.log_level = wp.LOG_WARNING
     device = wp.get_device(options.device)
-    env = make(worlds, envs.configuration(ENVIRONMENT, options), device)
+    env = make(worlds, task_configuration(options), device)
     spans = {}
     for actions in options.actions:
         source = warmed_up(env, actions, options)
@@ -146,18 +148,35 @@ def play_part(worlds: int, options: argparse.Namespace, barrier: Any, results: A
     results.put(spans)
 
 
+def add_object_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options that `task_configuration` reads."""
+    parser.add_argument("--preset", default=None, help="such as beam, Isaac Lab's object")
+    parser.add_argument(
+        "--poissons-ratio", type=float, nargs=2, default=None, help="range from which each world draws at each reset"
+    )
+
+
+def task_configuration(options: argparse.Namespace) -> Any:
+    """Return the configuration of LiftSoft, with 4 steps of 1/120 s per control step."""
+    known = config_class(ENVIRONMENT)
+    config = known() if options.preset in (None, "plush") else known.preset(options.preset)
+    ratios = None if options.poissons_ratio is None else tuple(options.poissons_ratio)
+    scene = replace(config.scene, control_hz=30.0, substeps=4)
+    return replace(config, scene=scene, poissons_ratio_range=ratios)
+
+
 def configuration(axis: str, value: int, options: argparse.Namespace) -> Any:
     """Return the configuration of LiftSoft with one value of an axis."""
-    config = envs.configuration(ENVIRONMENT, options)
-    thing = config.scene.object
-    build = thing.build
+    config = task_configuration(options)
+    toy = config.scene.object
+    build = toy.build
     if axis == "functions":
         # as many points for each function as the default object has, so that its forces are as good
         build = replace(build, function_count=value, cubature_count=max(96, 4 * value))
     if axis == "points":
         build = replace(build, cubature_count=value)
-    thing = replace(thing, build=build, **({"surface_count": value} if axis == "samples" else {}))
-    return replace(config, scene=replace(config.scene, object=thing))
+    toy = replace(toy, build=build, **({"surface_count": value} if axis == "samples" else {}))
+    return replace(config, scene=replace(config.scene, object=toy))
 
 
 def make(worlds: int, config: Any, device: wp.Device) -> Any:
@@ -173,11 +192,15 @@ def row(worlds: int, config: Any, device: wp.Device, options: argparse.Namespace
     before = held(device)
     env = make(worlds, config, device)
     rates, touching = dict.fromkeys(("random", "grasp"), ""), ""
+    measured: dict[str, float | str] = {}
     for actions in options.actions:
         found, share_touching = rate(env, actions, device, options)
         rates[actions] = f"{found:,.0f}"
+        measured[f"{options.preset or 'plush'}_{actions}_{worlds}"] = round(found)
         if actions == "grasp":
             touching = f"{100 * share_touching:.0f} %"
+    if options.record and options.axes == ["worlds"]:
+        record("scaling", measured, str(device))
     memory = (held(device) - before) / worlds
     tables = env.task.scene.solver.reduced.tables
     iterations, contacts = (array.numpy().mean() for array in (tables.newton.iteration, tables.constraints.count))

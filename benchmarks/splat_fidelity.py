@@ -17,6 +17,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -198,8 +199,8 @@ class Moved:
     def __init__(self, splats: Splats, values: Callable[[Array], Array], *, averaged: bool = True) -> None:
         """Evaluate the functions."""
         self.splats = splats
-        narrow = splats.covariances() if averaged else np.tile(1e-30 * np.eye(3), (splats.count, 1, 1))
-        self.basis, self.gradient = average_basis(values, splats.means, narrow)
+        widths = splats.covariances() if averaged else np.tile(1e-30 * np.eye(3), (splats.count, 1, 1))
+        self.basis, self.gradient = average_basis(SimpleNamespace(values=values, narrow=0.0), splats.means, widths)
 
     @classmethod
     def by(cls, motion: Motion, splats: Splats, **options: Any) -> Moved:

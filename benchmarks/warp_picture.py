@@ -1,4 +1,4 @@
-"""PIE-NeRF's figure 10 with splats: the motion of each by that of the nearest integrator point, affine or quadratic.
+"""Splats that bend: the motion of each by that of the nearest integrator point, affine or quadratic.
 
 A painted bar is bent by 180 degrees. PIE-NeRF knows its motion at integrator points and continues it from the nearest
 one: x = x_k + F_k d (affine), or + 1/2 d^T H_k d with H the second derivatives (quadratic). softmode evaluates its

@@ -141,8 +141,8 @@ def _reference(match: re.Match[str]) -> str:
 def _resolve(app: Any, env: Any, node: Any, shown: Any) -> Any:
     """Link a name that a docstring gives by its module to where its package offers it."""
     if not _PUBLIC:
-        for package in app.srcdir.joinpath("api").glob("*.md"):
-            face = f"softmode.{package.stem}"
+        pages = "".join(page.read_text() for page in app.srcdir.joinpath("api").glob("*.md"))
+        for face in dict.fromkeys(re.findall(r"^```\{entries\} (\S+)$", pages, re.M)):
             for name, value in _face(face).items():
                 _PUBLIC[f"{getattr(value, '__module__', '')}.{getattr(value, '__qualname__', '')}"] = f"{face}.{name}"
     target = node.get("reftarget", "")

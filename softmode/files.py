@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import functools
+import inspect
 import io
 import json
 import math
 import os
 import stat
 import zipfile
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
-from typing import IO, Any, BinaryIO
+from typing import IO, Any, BinaryIO, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +21,8 @@ from numpy.typing import NDArray
 from softmode.errors import AssetError, BasisError, ConfigError, SoftmodeError, StorageError, memory_errors
 from softmode.leftovers import Claim
 
+REEXPORT = "The file is damaged or incomplete: copy or export it again"
+"""The remedy for a file that contradicts itself."""
 PLACE_HINT = "check the folder, its permissions and the free space"
 """The remedy for a file that cannot be written."""
 MAX_HEADER = 1 << 20
@@ -29,6 +33,8 @@ UNPACKED_FREE, UNPACKED_RATIO = 64 << 20, 2
 """Bytes that the arrays of an archive may unpack to: so many, or so many for each byte of the file."""
 _PACKED_FREE = 32 << 20
 _CHUNK = 1 << 22
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
 
 
 @contextlib.contextmanager
@@ -173,13 +179,18 @@ def whole_file(path: str | os.PathLike[str], what: str = "file", *, make_folders
 
 
 @contextlib.contextmanager
-def damage_errors(what: str, *, hint: str, error: type[SoftmodeError] = AssetError) -> Iterator[None]:
+def damage_errors(
+    what: str, *, hint: str = REEXPORT, error: type[SoftmodeError] = AssetError, arguments: bool = False
+) -> Iterator[None]:
     """Turn whatever reading a file in a block raises into one typed error; typed errors pass, but those of arguments.
+
+    What is raised with a `hint` of its own, as by `softmode.foreign.child`, keeps its text and hint.
 
     Args:
         what: The file, for the message.
         hint: The remedy.
         error: What is raised.
+        arguments: Whether the block takes arguments of its caller, whose errors pass too.
 
     Raises:
         AssetError: Or ``error``, if the block raises anything that is not typed.
@@ -187,10 +198,10 @@ def damage_errors(what: str, *, hint: str, error: type[SoftmodeError] = AssetErr
     try:
         yield
     except (ConfigError, BasisError) as caught:  # what the file said was no good argument
-        if isinstance(caught, error):
+        if arguments or isinstance(caught, error):
             raise
         raise error(f"{what}: {caught.message}", hint=caught.hint or hint) from caught
-    except SoftmodeError:
+    except (SoftmodeError, Warning):
         raise
     except FileNotFoundError as caught:
         raise error(f"{what}: does not exist", hint=hint) from caught
@@ -199,7 +210,31 @@ def damage_errors(what: str, *, hint: str, error: type[SoftmodeError] = AssetErr
     except Exception as caught:  # zlib, struct and zipfile errors of a damaged file have no common base
         if isinstance(caught, OSError) and caught.strerror:
             raise error(f"{what}: cannot be read ({caught.strerror})", hint=hint) from caught
-        raise error(f"{what}: damaged or no such thing ({type(caught).__name__}: {caught})", hint=hint) from caught
+        said = str(caught)[:300]
+        if own := getattr(caught, "hint", None):
+            raise error(f"{what}: {said}", hint=own) from caught
+        raise error(f"{what}: damaged or no such thing ({type(caught).__name__}: {said})", hint=hint) from caught
+
+
+def reader(what: str) -> Callable[[Callable[_P, _T]], Callable[_P, _T]]:
+    """Decorate a reader: whatever it raises, once called rightly, becomes an AssetError that names its first argument.
+
+    Args:
+        what: What is read, as messages call it.
+    """
+
+    def decorate(function: Callable[_P, _T]) -> Callable[_P, _T]:
+        signature = inspect.signature(function)
+
+        @functools.wraps(function)
+        def wrapped(*args: _P.args, **options: _P.kwargs) -> _T:
+            given = signature.bind(*args, **options).arguments
+            with damage_errors(f"{what} {next(iter(given.values()))}", arguments=True):
+                return function(*args, **options)
+
+        return wrapped
+
+    return decorate
 
 
 def open_file(

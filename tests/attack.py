@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import importlib
 import json
 import os
@@ -17,6 +18,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 _TICK = os.sysconf("SC_CLK_TCK")
+_PARENT_DEATH_SIGNAL = 1
+"""PR_SET_PDEATHSIG of prctl(2)."""
 CAP, WALL = 6 * 2**30, 60.0
 """Memory above the start [bytes] and wall clock [s] at which a reader is ended, for the good of the machine."""
 
@@ -121,6 +124,8 @@ def _status(name: str) -> int:
 
 def main() -> None:
     """Read the files that the standard input names with the reader that the first argument names."""
+    if sys.platform == "linux":  # a reader that does not come to an end ends with whoever watches it
+        ctypes.CDLL(None).prctl(_PARENT_DEATH_SIGNAL, signal.SIGKILL)
     from softmode.errors import SoftmodeError
 
     out = os.fdopen(os.dup(1), "w")

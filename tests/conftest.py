@@ -91,7 +91,6 @@ _FAST = {
     "view/test_session.py": "time_passes_as_told pick_meets_the_near_face time_that_did_not_fit_is_lost",
     "scenes/test_meshes.py": "bounds_and_volume",
     "deformables/test_driven.py": "driven_regions_follow_their_poses",
-    "deformables/test_proxy.py": "free_body_alone",
     "mpm/test_shapes.py": "momentum_goes_to_the_shapes",
     "radiance/test_grid.py": "plenoxels",
     "usd/test_import_scene.py": "material_of_ancestors_and_purposes",

@@ -198,6 +198,25 @@ READERS: dict[str, Callable[[Path], Any]] = {
     "dataset": _dataset,
 }
 """Readers by format."""
+PACKAGES: dict[str, tuple[tuple[str, ...], str]] = {
+    **dict.fromkeys(("stage", "stage packed", "stage splats", "stage body", "animation"), (("pxr",), "usd-core")),
+    "dataset": (("pyarrow",), "pyarrow"),
+    "checkpoint": (("torch",), "torch"),
+    "spz 4": (("backports.zstd", "compression"), "backports.zstd"),
+}
+"""Packages one of which a format needs, and what installs them."""
+
+
+def absent() -> dict[str, str]:
+    """Return what has to be installed for the formats that cannot be tried here."""
+
+    def there(package: str) -> bool:
+        try:
+            return importlib.util.find_spec(package) is not None
+        except ModuleNotFoundError:  # of a package in a package
+            return False
+
+    return {name: install for name, (packages, install) in PACKAGES.items() if not any(map(there, packages))}
 
 
 def _npz(pack: bool = False, **arrays: Any) -> bytes:
@@ -230,15 +249,14 @@ def seeds(folder: Path, formats: Collection[str] | None = None) -> Seeds:
         _mesh_seeds: ("mesh ply", "obj", "stl", "off", "glb", "gltf", "points ply", "xyz"),
         _text_seeds: ("mjcf", "urdf", "options", "run"),
     }
-    if importlib.util.find_spec("pxr"):
-        makers[_stage_seeds] = ("stage", "stage packed", "stage splats", "stage body", "animation")
-    if importlib.util.find_spec("pyarrow"):
-        makers[_dataset_seeds] = ("dataset",)
+    makers[_stage_seeds] = ("stage", "stage packed", "stage splats", "stage body", "animation")
+    makers[_dataset_seeds] = ("dataset",)
+    wanted = set(READERS if formats is None else formats) - absent().keys()
     found: Seeds = {}
     for make, names in makers.items():
-        if formats is None or set(formats) & set(names):
+        if wanted & set(names):
             found |= make(folder)
-    return {name: seed for name, seed in found.items() if formats is None or name in formats}
+    return {name: seed for name, seed in found.items() if name in wanted}
 
 
 def _dataset_seeds(folder: Path) -> Seeds:
@@ -270,7 +288,7 @@ def _splat_seeds(folder: Path) -> Seeds:
         "spz packed": (".spz", "bytes", [spz_3()]),
         "sog": (".sog", "zip", [zip_sog(folder / "a.sog", meta, images).read_bytes()]),
     }
-    if importlib.util.find_spec("backports.zstd") or importlib.util.find_spec("compression"):
+    if "spz 4" not in absent():
         found["spz 4"] = ".spz", "bytes", [pack_spz(4, 3, 40, 11, spz_arrays(4, 3)[0])]
     return found
 
@@ -335,7 +353,7 @@ def array_seeds(folder: Path) -> Seeds:
         "radiance": (".npz", "zip", [_npz(True, **small()), _npz(**plenoxels()), _npz(**plain)]),
         "nanovdb": (".nvdb", "nvdb", [(folder / "none").read_bytes(), with_checksums((folder / "none").read_bytes())]),
     }
-    if importlib.util.find_spec("torch"):
+    if "checkpoint" not in absent():
         from softmode.learning.checkpoints import write_checkpoint
         from tests.learning.test_checkpoints import checkpoint
 

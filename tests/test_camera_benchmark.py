@@ -44,11 +44,10 @@ def test_splats_are_flat_on_a_sphere() -> None:
 
 
 def test_tables_are_printed(capsys: pytest.CaptureFixture[str]) -> None:
-    """A run without peers checks the pictures, prints a row per world count, and says that threads change no bit."""
+    """A run without peers checks the pictures and prints a row per world count."""
     assert camera.main(TINY) == 0
     text = capsys.readouterr().out
     assert text.count(", ok") == 2 and "WRONG" not in text
-    assert "same bits" in text and "DIFFER" not in text
     rows = [line.split("|")[0].split() for line in text.splitlines() if "pool's peak" in line]
     assert rows == [["16", "1"], ["16", "2"]]
 

@@ -17,7 +17,7 @@ import pytest
 import softmode
 
 ROOT = Path(__file__).resolve().parents[1]
-CORE = {"newton", "warp-lang", "gymnasium", "numpy", "scipy", "trimesh", "tqdm", "pillow", "threadpoolctl"}
+CORE = {"newton", "mujoco", "warp-lang", "gymnasium", "numpy", "scipy", "trimesh", "tqdm", "pillow", "threadpoolctl"}
 """What an installation without extras asks for."""
 STEP = """
 import sys

@@ -2,7 +2,7 @@
 
 Run: ``python -m benchmarks.freeform [--tables 1 2 3 4 5] [--figures 4 7] [--quick] [--output out/freeform.json]``.
 What is run replaces its part of the output; Table 2 goes on where it was left.
-`docs/freeform_tables.md` says what the rows mean. SPH is not run.
+`benchmarks/freeform/TABLES.md` says what the rows mean. SPH is not run.
 """
 
 from __future__ import annotations
@@ -119,6 +119,8 @@ def main() -> None:
     everything = options.tables is None and options.figures is None
     tables = set(range(1, 6)) if everything else set(options.tables or ())
     asked = set() if options.print else tables
+    if options.print and not options.output.exists():
+        parser.error(f"{options.output} does not exist: run python -m benchmarks.freeform first, or give --output")
     stored: dict[str, Any] = json.loads(options.output.read_text()) if options.output.exists() else {}
 
     def save(**found: Any) -> None:
@@ -144,6 +146,11 @@ def main() -> None:
     for number in sorted(tables):
         if f"table{number}" in stored:
             printers[number](stored[f"table{number}"])
+        elif options.print:
+            print(f"\nTable {number} is not in {options.output}")
+    for number in (4, 7) if options.print else ():
+        if f"figure{number}" in stored and (everything or number in (options.figures or ())):
+            print(f"figure {number}:", stored[f"figure{number}"])
 
 
 if __name__ == "__main__":

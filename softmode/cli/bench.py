@@ -5,8 +5,9 @@ from __future__ import annotations
 import dataclasses
 from typing import Annotated, Any, Literal
 
-from softmode.cli.common import own_object, quiet_warp, warn_of_object
+from softmode.cli.common import own_group, quiet_warp, warn_of_env
 from softmode.cli.object_options import ObjectOptions
+from softmode.cli.robot_options import RobotOptions
 from softmode.errors import ConfigError
 from softmode.learning.config_values import split_config
 
@@ -42,7 +43,9 @@ class Bench:
     """What observations are; torch on CUDA and numpy on CPU if omitted."""
     stages: bool = False
     """Print the time of the parts of a step."""
-    toy: Annotated[ObjectOptions, own_object()] = dataclasses.field(default_factory=ObjectOptions)
+    arm: Annotated[RobotOptions, own_group()] = dataclasses.field(default_factory=RobotOptions)
+    """Another robot in place of the built-in arm."""
+    toy: Annotated[ObjectOptions, own_group()] = dataclasses.field(default_factory=ObjectOptions)
     """Your own object; what is left out is as the task, the policy's run or the file has it."""
 
     def run(self) -> int:
@@ -58,12 +61,13 @@ class Bench:
             device = checked_device(self.device)
             chosen = {} if self.preset is None else {"preset": self.preset}
             config, _ = split_config(self.env, self.toy.env_options(self.env, chosen))
+            robot = self.arm.env_options()
             if self.image_size is not None:
                 config = dataclasses.replace(config, image_size=self.image_size)
             given: dict[str, Any] = {"obs_type": self.obs_type, "config": config, "processes": self.processes}
-            given |= {"device": str(device), "output": self.output or ("torch" if device.is_cuda else "numpy")}
+            given |= robot | {"device": str(device), "output": self.output or ("torch" if device.is_cuda else "numpy")}
             how = {"steps": self.steps, "warmup": self.warmup, "actions": self.actions, "stages": self.stages}
             for count in self.num_envs:
-                tell = warn_of_object if count == self.num_envs[0] else None
+                tell = warn_of_env if count == self.num_envs[0] else None
                 report_throughput(self.env, count, given, made=tell, **how)
         return 0

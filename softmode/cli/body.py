@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from softmode.cli.common import finding_line, optional_argument, own_object, quiet_warp, same_fields, short_name
+from softmode.cli.common import finding_line, optional_argument, own_group, quiet_warp, same_fields, short_name
 from softmode.cli.object_options import ObjectOptions, named_numbers, typed
 from softmode.errors import ConfigError, GraspError
 from softmode.files import check_place
@@ -61,7 +61,7 @@ class _Asset:
     [1/m^2]. Coordinates: z up, bounding box centred over the origin, standing on z = 0; inf is allowed."""
     seed: int = 0
     """Seed of every random choice of the build."""
-    toy: Annotated[ObjectOptions, own_object()] = dataclasses.field(default_factory=ObjectOptions)
+    toy: Annotated[ObjectOptions, own_group()] = dataclasses.field(default_factory=ObjectOptions)
     """Your own object; what is left out is as the task, the policy's run or the file has it."""
 
     @property

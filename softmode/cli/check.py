@@ -5,8 +5,9 @@ from __future__ import annotations
 import dataclasses
 from typing import Annotated
 
-from softmode.cli.common import own_object, quiet_warp, robot_options
+from softmode.cli.common import own_group, quiet_warp
 from softmode.cli.object_options import ObjectOptions
+from softmode.cli.robot_options import RobotOptions, tell_of
 from softmode.envs.catalogue import registered_id
 
 
@@ -21,21 +22,25 @@ class Check:
     """Id of the environment, for example softmode/LiftSoft-v0, or module:id of your own."""
     episodes: int = 5
     """Episodes of the scripted policy."""
-    robot: str | None = None
-    """Robot in place of the built-in arm: a name of `softmode robots list`, or an MJCF, URDF or OpenUSD file."""
-    toy: Annotated[ObjectOptions, own_object()] = dataclasses.field(default_factory=ObjectOptions)
+    arm: Annotated[RobotOptions, own_group()] = dataclasses.field(default_factory=RobotOptions)
+    """Another robot in place of the built-in arm."""
+    toy: Annotated[ObjectOptions, own_group()] = dataclasses.field(default_factory=ObjectOptions)
     """Your own object; what is left out is as the task has it."""
 
     def run(self) -> int:
         """Print a line per check; return 1 if one fails."""
+        from softmode.envs.robots import loaded
         from softmode.learning.config_values import with_config
         from softmode.testing import check_task
 
         registered_id(self.env)
 
         with quiet_warp():
-            given = self.toy.env_options(self.env, {}) | robot_options(self.robot)
+            given = self.toy.env_options(self.env, {}) | self.arm.env_options()
             options = with_config(self.env, given) if given else {}
+            if "robot" in given:
+                options["robot"] = loaded(given["robot"])
+                tell_of(options["robot"])
             found = check_task(self.env, episodes=self.episodes, **options)
         words = {True: "ok", False: "FAILED", None: "skipped"}
         for check in found:

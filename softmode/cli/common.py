@@ -8,7 +8,6 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import fields
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 from softmode.errors import ConfigError
@@ -69,20 +68,11 @@ class _KernelCount:
             self._bar.close()
 
 
-def own_object() -> Any:
-    """Return what shows the options of an own object as a group of their own; evaluated when tyro reads it."""
+def own_group() -> Any:
+    """Return what shows the options of an own object or robot as a group of theirs; evaluated when tyro reads it."""
     import tyro
 
     return tyro.conf.OmitArgPrefixes
-
-
-def robot_options(robot: str | None) -> dict[str, str]:
-    """Return the keyword argument of environments that names a robot, a file by its whole path; none if omitted."""
-    if robot is None:
-        return {}
-    from softmode.robots.assets import names_file
-
-    return {"robot": str(Path(robot).resolve()) if names_file(robot) else robot}
 
 
 def optional_argument() -> Any:
@@ -98,20 +88,24 @@ def finding_line(finding: Finding, stream: TextIO) -> str:
     severity = finding.severity
     if stream.isatty() and not os.environ.get("NO_COLOR"):
         severity = f"\x1b[{'31' if severity == 'broken' else '33'}m{severity}\x1b[0m"
-    return f"{severity}: {finding.name}: {finding.what}. {remedy}."
+    return f"{severity}: {finding.name}: {finding.what}." + (f" {remedy}." if remedy else "")
 
 
-def warn_of_object(env: Any) -> None:
-    """Print, on stderr, what the user should know about an environment's object that is a file or a preset.
+def warn_of_env(env: Any) -> None:
+    """Print, on stderr, what the user should know about an environment's robot and object that come from files.
 
     Args:
         env: A single or a vector environment; one that is not softmode's has no such object.
     """
+    from softmode.cli.robot_options import tell_of
     from softmode.objects.loader import load
+    from softmode.robots.arm import ArmDescription
 
     base = env.unwrapped
     if not hasattr(base, "task_class"):
         return
+    if not isinstance(base.config.scene.arm, ArmDescription):
+        tell_of(base.config.scene.arm.robot)
     if base.config.object_set is not None:  # the task has checked them
         return
     scene = base.config.scene

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import operator
+import os
 import sys
 from typing import Annotated, Any
 
@@ -42,7 +43,8 @@ softmode list-envs lists the tasks, softmode --help the commands, softmode play 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; return the exit code.
 
-    Errors that softmode expects print one line and return 2, Ctrl-C returns 130, SIGTERM 143.
+    Errors that softmode expects print one line and return 2. Ctrl-C returns 130, a reader of the output that is gone
+    141, SIGTERM 143.
     """
     with ending_on_sigterm() as ended, contextlib.ExitStack() as stack:
         with contextlib.suppress(AttributeError):  # of a stream that is none of Python's own
@@ -94,6 +96,9 @@ def _run(arguments: list[str] | None, stack: contextlib.ExitStack) -> int:
     except MemoryError as error:
         print(f"softmode: error: more memory is asked for than there is. {error}".rstrip(". "), file=sys.stderr)
         return 2
+    except BrokenPipeError:  # the reader, such as head, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        return 141
     except OSError as error:
         print(f"softmode: error: {error}. Check the path and the free space", file=sys.stderr)
         return 2

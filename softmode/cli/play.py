@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from softmode.checks import require_number, require_numbers
-from softmode.cli.common import BuildBar, bar_interval, own_object, quiet_warp, robot_options, warn_of_object
+from softmode.cli.common import BuildBar, bar_interval, own_group, quiet_warp, warn_of_env
 from softmode.cli.object_options import ObjectOptions
+from softmode.cli.robot_options import RobotOptions
 from softmode.envs.catalogue import registered_id
 from softmode.errors import ConfigError
 from softmode.learning.config_values import split_config
@@ -58,11 +59,11 @@ class Play:
     """OpenUSD stage to write (.usdc, .usd or .usda)."""
     usd_mode: Literal["handles", "baked"] = "handles"
     """What the stage samples: handle matrices only, or also every splat."""
-    robot: str | None = None
-    """Robot in place of the built-in arm: a name of `softmode robots list`, or an MJCF, URDF or OpenUSD file."""
     device: str | None = None
     """Warp device, for example cpu or cuda:0."""
-    toy: Annotated[ObjectOptions, own_object()] = dataclasses.field(default_factory=ObjectOptions)
+    arm: Annotated[RobotOptions, own_group()] = dataclasses.field(default_factory=RobotOptions)
+    """Another robot in place of the built-in arm."""
+    toy: Annotated[ObjectOptions, own_group()] = dataclasses.field(default_factory=ObjectOptions)
     """Your own object; what is left out is as the task, the policy's run or the file has it."""
 
     def run(self) -> int:
@@ -102,10 +103,10 @@ def _play(options: Play, film: Film | None) -> int:
     background = None if options.background is None else _background(options.background, options.background_pose)
     with quiet_warp():
         with BuildBar() as progress:
-            given |= robot_options(options.robot)
+            given |= options.arm.env_options()
             given |= {"config": config, "device": options.device, "progress": progress}
             env = gym.make(options.env, render_mode="rgb_array" if film or options.rerun else None, **given)
-        warn_of_object(env)
+        warn_of_env(env)
         try:
             if trained:
                 trained.check(env)

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from softmode.cli.common import (
     BuildBar,
     bar_interval,
-    own_object,
+    own_group,
     quiet_warp,
-    robot_options,
     short_name,
-    warn_of_object,
+    warn_of_env,
 )
 from softmode.cli.object_options import ObjectOptions
+from softmode.cli.robot_options import RobotOptions
 from softmode.envs.catalogue import purpose, registered_id
 from softmode.errors import ConfigError
 from softmode.learning.config_values import with_config
@@ -61,11 +61,11 @@ class Record:
     """Record the state in which each episode begins, to begin episodes with."""
     append: bool = False
     """Add to the dataset in the folder, if there is one."""
-    robot: str | None = None
-    """Robot in place of the built-in arm: a name of `softmode robots list`, or an MJCF, URDF or OpenUSD file."""
     device: str | None = None
     """Warp device, for example cpu or cuda:0."""
-    toy: Annotated[ObjectOptions, own_object()] = dataclasses.field(default_factory=ObjectOptions)
+    arm: Annotated[RobotOptions, own_group()] = dataclasses.field(default_factory=RobotOptions)
+    """Another robot in place of the built-in arm."""
+    toy: Annotated[ObjectOptions, own_group()] = dataclasses.field(default_factory=ObjectOptions)
     """Your own object; what is left out is as the task, the policy's run or the file has it."""
 
     def run(self) -> int:
@@ -87,18 +87,18 @@ class Record:
         given: dict[str, Any] = {"obs_type": "pixels_agent_pos"} if trained is None else dict(trained.env_options)
         if self.obs_type is not None:
             given["obs_type"] = self.obs_type
-        given = self.toy.env_options(self.env, given) | robot_options(self.robot)
+        given = self.toy.env_options(self.env, given) | self.arm.env_options()
         with quiet_warp():
             with BuildBar() as progress:
                 made = {**with_config(self.env, given), "device": self.device, "progress": progress}
                 env = gym.make(self.env, **made)
-            warn_of_object(env)
+            warn_of_env(env)
         try:
             policy = policy_factory(self.policy, env, trained)
             features = environment_features(env, pictures=self.pictures)
             origin = {"env": self.env, "env_options": given}
             fps = int(env.metadata["render_fps"])
-            robot = ROBOT if self.robot is None else Path(self.robot).stem
+            robot = ROBOT if self.arm.robot is None else Path(self.arm.robot).stem
             with (
                 DatasetWriter(out, features, fps=fps, robot_type=robot, append=self.append, origin=origin) as writer,
                 tqdm(total=self.episodes, desc="recording", unit="episode", mininterval=bar_interval()) as bar,

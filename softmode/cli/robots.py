@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from softmode.cli.common import short_name
+from softmode.cli.common import own_group, short_name
+from softmode.cli.robot_options import RobotFile
 from softmode.errors import ConfigError
 from softmode.files import check_place
 
@@ -27,14 +29,12 @@ class Robots:
     """What to fetch or check, for example so101 ur5e arm.urdf arm.usd."""
     out: Annotated[Path | None, short_name("-o")] = None
     """Picture that check writes, NAME.png here if omitted; one robot only."""
-    end_effector: str | None = None
-    """Site or body that carries the tool, for check."""
     root: str | None = None
     """Body whose subtree is the robot, for check."""
-    asset_root: Path | None = None
-    """Folder outside which the file may refer to nothing, for check; its own folder if omitted."""
     drive_bandwidth: float = 8.0
     """Natural frequency of the drives of joints without a servo [Hz], for check."""
+    file: Annotated[RobotFile, own_group()] = dataclasses.field(default_factory=RobotFile)
+    """How the file is to be read, for check."""
 
     def run(self) -> int:
         """Print the names, fetch the models, or check the files."""
@@ -67,16 +67,11 @@ class Robots:
         if out.suffix.lower() != ".png":
             raise ConfigError(f"out {out} is no .png file", hint="name it like arm.png")
         check_place(out, "picture", make_folders=False)
-        robot = load(
-            name,
-            end_effector=self.end_effector,
-            root=self.root,
-            asset_root=self.asset_root,
-            drive_bandwidth=self.drive_bandwidth,
-        )
+        robot = load(name, root=self.root, drive_bandwidth=self.drive_bandwidth, **self.file.loading)
         print("\n".join(robot_table(robot)))
         write_robot_picture(out, robot)
         print(f"picture          {out}")
+        print("\n".join(task_lines(robot)))
 
 
 def robot_table(robot: RobotDescription) -> list[str]:
@@ -113,4 +108,26 @@ def robot_table(robot: RobotDescription) -> list[str]:
         else:
             row += f"{drive.stiffness:>11.4g}{drive.damping:>10.4g}{drive.effort_limit:>9.3g}{frequency[j]:>8.2g}"
             lines.append(row)
-    return [*lines, "", "guessed:", *(f"  {note}" for note in robot.notes)]
+    return ["guessed, left out:", *(f"  {note}" for note in robot.notes), "", *lines, ""]
+
+
+def task_lines(robot: RobotDescription) -> list[str]:
+    """Return a line per task: whether the robot plays it, and why not."""
+    from softmode import ENVIRONMENTS
+    from softmode.envs.arguments import Shortcuts, checked_config
+    from softmode.envs.catalogue import env_class
+    from softmode.robots.table_robot import TableRobot
+
+    lines = []
+    for name in ENVIRONMENTS:
+        task = env_class(name).task_class
+        try:
+            arm = checked_config(task.config_class, None, Shortcuts(robot=robot), task.any_robot).scene.arm
+            assert isinstance(arm, TableRobot)
+            x, y, z, turn = arm.base
+            said = f"yes, from ({x:.2f}, {y:.2f}, {z:.2f}) m turned by {math.degrees(turn):.0f} deg"
+            said += f", in {100 * arm.share:.0f} % of its ranges" if arm.share < 1.0 else ""
+        except ConfigError as error:
+            said = f"no, because {error.message}"
+        lines.append(f"{task.__name__ + ':':<17}{said}")
+    return lines

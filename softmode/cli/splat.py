@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from pathlib import Path
 from typing import Any, Literal
 
@@ -112,6 +113,8 @@ class SplatInfo:
         print(f"scales      {row(np.quantile(splats.scales.max(axis=1), deciles))}  (10, 50, 90 %, longest axis)")
         print(f"flatness    {row(np.median(splats.scales.min(axis=1) / splats.scales.max(axis=1)))}")
         print(f"opacities   {row(np.quantile(splats.opacities, deciles))}  (10, 50, 90 %)")
+        for note in splats.notes:
+            print(f"note        {note}")
         return 0
 
 
@@ -174,6 +177,8 @@ class SplatConvert:
     (spz: y up); those that take a file as training leaves it (trained: y down). Without it the numbers stay."""
     up: Literal["+x", "-x", "+y", "-y", "+z", "-z"] | None = None
     """Axis of the file to read that points up, with --convention; -y for splats, +z for OpenUSD if omitted."""
+    drop_invalid: bool = False
+    """Leave out splats that are not finite or have no rotation or size; without it a file with such is refused."""
 
     def run(self) -> int:
         """Read and write."""
@@ -183,12 +188,21 @@ class SplatConvert:
         check_splat_target(self.target)
         if self.convention is None and self.up is not None:
             raise ConfigError("--up says nothing without a convention", hint="give --convention too, like spz")
-        splats = read_splats(self.source)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # said below, or refused
+            splats = read_splats(self.source)
+        if splats.dropped_count and not self.drop_invalid:
+            problem = (
+                f"splat file {self.source}: {splats.dropped_count} splats are not finite or have no rotation or size"
+            )
+            raise AssetError(problem, hint=f"add --drop-invalid to leave them out and keep {splats.count}")
         if self.convention is None:
             write_splats(self.target, splats)
         else:
             own = "+z" if self.source.suffix.lower() in tokens.SUFFIXES else "-y"
             write_splats(self.target, splats.oriented(self.up or own), up=CONVENTIONS[self.convention])
+        for note in splats.notes:
+            print(f"note: {note}")
         print(f"wrote {splats.count} splats of degree {splats.sh_degree} to {self.target}")
         return 0
 

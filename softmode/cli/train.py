@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from softmode.checks import require_number
-from softmode.cli.common import own_object, quiet_warp, same_fields, warn_of_object
+from softmode.cli.common import own_group, quiet_warp, same_fields, warn_of_env
 from softmode.cli.object_options import ObjectOptions
+from softmode.cli.robot_options import RobotOptions
 from softmode.envs.catalogue import is_soft
 from softmode.errors import ConfigError
 from softmode.learning.players import require_torch
@@ -61,14 +62,17 @@ class Train:
     """Episodes of the evaluation at the end; none with 0."""
     checkpoint_seconds: float = 30.0
     """Seconds between two checkpoints."""
-    toy: Annotated[ObjectOptions, own_object()] = dataclasses.field(default_factory=ObjectOptions)
+    arm: Annotated[RobotOptions, own_group()] = dataclasses.field(default_factory=RobotOptions)
+    """Another robot in place of the built-in arm."""
+    toy: Annotated[ObjectOptions, own_group()] = dataclasses.field(default_factory=ObjectOptions)
     """Your own object; what is left out is as the task, the policy's run or the file has it."""
 
     def run(self) -> int:
         """Train; return the exit code."""
         require_torch()
-        if self.resume and self.toy.is_given:
-            raise ConfigError("--resume goes on with the object of the run", hint="leave the object's options out")
+        if self.resume and (self.toy.is_given or self.arm != RobotOptions()):
+            hint = "leave the options of object and robot out"
+            raise ConfigError("--resume goes on with object and robot of the run", hint=hint)
         from softmode.learning.environments import make_vector_env
         from softmode.learning.train_options import TrainOptions
         from softmode.learning.trainer import train
@@ -77,11 +81,12 @@ class Train:
             """Return the worlds, and say what there is to say about their object."""
             env = make_vector_env(*arguments)
             if os.environ.get("RANK", "0") == "0":
-                warn_of_object(env)
+                warn_of_env(env)
             return env
 
         given = same_fields(self, TrainOptions)
         given["env_options"] = self.toy.env_options(self.env, parse_env_options(self.env_options, self.obs_type))
+        given["env_options"] |= self.arm.env_options()
         given["total_steps"] = None if self.total_steps is None else int(self.total_steps)
         given["processes"] = self.process_count()
         options = TrainOptions(**given, overrides=parse_overrides(self.set))
@@ -125,7 +130,9 @@ class Evaluate:
     """What the policy sees; as in its run if omitted."""
     env_options: str = "{}"
     """Further keyword arguments of the environment as JSON."""
-    toy: Annotated[ObjectOptions, own_object()] = dataclasses.field(default_factory=ObjectOptions)
+    arm: Annotated[RobotOptions, own_group()] = dataclasses.field(default_factory=RobotOptions)
+    """Another robot in place of the built-in arm."""
+    toy: Annotated[ObjectOptions, own_group()] = dataclasses.field(default_factory=ObjectOptions)
     """Your own object; what is left out is as the task, the policy's run or the file has it."""
 
     def run(self) -> int:
@@ -138,11 +145,11 @@ class Evaluate:
         require_number("num_envs", self.num_envs, at_least=1, hint="give a count like 16")
         policy = load_policy(self.policy, self.device)
         options = {**policy.env_options, **parse_env_options(self.env_options, self.obs_type)}
-        options = self.toy.env_options(self.env, options)
+        options = self.toy.env_options(self.env, options) | self.arm.env_options()
         device = local_device(self.device)
         with quiet_warp():
             env = make_vector_env(self.env, self.num_envs, device, options)
-            warn_of_object(env)
+            warn_of_env(env)
             try:
                 policy.check(env)
                 print(evaluate(env, policy, self.episodes, seed=self.seed, device=device))

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from softmode import ENVIRONMENTS
 from softmode.checks import require_number
-from softmode.cli.common import BuildBar, own_object, quiet_warp, same_fields, warn_of, warp_device
+from softmode.cli.common import BuildBar, own_group, quiet_warp, same_fields, warn_of, warp_device
 from softmode.cli.object_options import ObjectOptions
+from softmode.cli.robot_options import RobotOptions, tell_of
 from softmode.errors import AssetError, ConfigError, SoftmodeError
 from softmode.learning.config_values import split_config
 from softmode.learning.players import trained_policy
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from softmode.view.app import ViewOptions
     from softmode.view.session import LiveSession
 
-_ELSEWHERE = ("target", "prepare", "toy", "splat", "object", "up", "crop")
+_ELSEWHERE = ("target", "prepare", "toy", "arm", "splat", "object", "up", "crop")
 """Options that the page which prepares a capture writes itself, or ends."""
 
 
@@ -64,7 +65,9 @@ class View:
     """What the button records: a video, coordinates, or an OpenUSD stage (extra [usd])."""
     device: str | None = None
     """Warp device, for example cpu or cuda:0."""
-    toy: Annotated[ObjectOptions, own_object()] = dataclasses.field(default_factory=ObjectOptions)
+    arm: Annotated[RobotOptions, own_group()] = dataclasses.field(default_factory=RobotOptions)
+    """Another robot in place of the built-in arm."""
+    toy: Annotated[ObjectOptions, own_group()] = dataclasses.field(default_factory=ObjectOptions)
     """Your own object; what is left out is as the task, the policy's run or the file has it."""
 
     def run(self) -> int:
@@ -190,9 +193,11 @@ def _session(options: View, show_progress: Callable[[str, float], None] | None =
     """Make the session that was asked for; `show_progress` is told stages and fractions beside the terminal."""
     from gymnasium.envs.registration import registry
 
+    from softmode.envs.arguments import Shortcuts, checked_config
     from softmode.envs.catalogue import env_class, registered_id
     from softmode.objects.config import ObjectConfig
     from softmode.objects.presets import PRESETS
+    from softmode.robots.table_robot import TableRobot
     from softmode.view.session import LiveSession
 
     options.toy.check()
@@ -207,10 +212,14 @@ def _session(options: View, show_progress: Callable[[str, float], None] | None =
             _refuse(options, ("scene", "hold"), "an environment")
             trained = trained_policy(options.policy, target)
             given = options.toy.env_options(target, dict(trained.env_options) if trained else {})
-            config, _ = split_config(target, given)
+            config, rest = split_config(target, given | options.arm.env_options())
+            robot = Shortcuts(robot=rest.get("robot"))
+            config = checked_config(type(config), config, robot, env_class(target).task_class.any_robot)
             session = LiveSession.from_env(
                 target, policy=options.policy, config=config, seed=options.seed, device=device, progress=progress
             )
+            if isinstance(config.scene.arm, TableRobot):
+                tell_of(config.scene.arm.robot)
             if config.scene.object.file is not None or config.scene.object.preset is not None:
                 grasps = env_class(target).task_class.grasps
                 warn_of(session.object, config.scene.arm if grasps else None)
@@ -221,6 +230,8 @@ def _session(options: View, show_progress: Callable[[str, float], None] | None =
                 hint=f"give a splat, mesh or .npz file, or one of {', '.join([*ENVIRONMENTS, *PRESETS])}",
             )
         _refuse(options, ("policy", "seed"), "an object")
+        if options.arm != RobotOptions():
+            raise ConfigError("a robot says nothing about an object", hint="leave its options out, or name a task")
         source = target
         if options.toy.shape or options.toy.file is not None or target in PRESETS:
             if target is not None and options.toy.file is not None:

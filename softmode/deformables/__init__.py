@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from softmode.deformables.build.quadrature_mesh import quadrature_from_mesh
     from softmode.deformables.build.reduced_stiffness import elastic_modes
     from softmode.deformables.build.report import BodyReport, report_body
-    from softmode.deformables.coupling.proxy import SolverReducedProxy
     from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
     from softmode.deformables.gradients.adjoint import AdjointOptions, AdjointReduced, ReducedGradients
     from softmode.deformables.gradients.adjoint_torch import rollout
@@ -84,7 +83,6 @@ __all__ = [
     "SolverCoupledReduced",
     "SolverReduced",
     "SolverReducedOptions",
-    "SolverReducedProxy",
     "SurfacePressure",
     "add_grip_slots",
     "add_pins",

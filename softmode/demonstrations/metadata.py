@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -84,7 +85,7 @@ def member(folder: Path, name: str) -> Path:
     return path
 
 
-@process.typed("table")
+@files.reader("table")
 def read_table(path: Path, columns: list[str] | None = None) -> Any:
     """Return a Parquet file's table, or of its columns those that are named and there.
 
@@ -95,7 +96,8 @@ def read_table(path: Path, columns: list[str] | None = None) -> Any:
     with tempfile.TemporaryDirectory() as folder:
         copy = f"{folder}/table.arrow"
         process.read("table", path, name=name, columns=columns, copy=copy)
-        with pa.OSFile(copy) as source:
+        # Windows removes no file that is mapped; elsewhere the table needs no copy of its bytes.
+        with (pa.OSFile if os.name == "nt" else pa.memory_map)(copy) as source:
             return pa.ipc.open_file(source).read_all()
 
 
@@ -108,7 +110,7 @@ def _rows(path: Path) -> list[dict[str, Any]]:
     return table.to_pylist()
 
 
-@process.typed("dataset")
+@files.reader("dataset")
 def read_metadata(folder: str | Path) -> Metadata:
     """Return what the dataset in a folder says about itself.
 

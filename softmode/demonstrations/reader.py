@@ -19,7 +19,7 @@ from softmode.demonstrations.pictures import decode_png, read_film
 from softmode.demonstrations.schema import INDEX_FEATURES, Feature
 from softmode.demonstrations.statistics import Statistics
 from softmode.errors import AssetError, ConfigError
-from softmode.foreign import process
+from softmode.files import reader
 
 if TYPE_CHECKING:
     from softmode.envs.env_state import EnvState
@@ -83,7 +83,7 @@ class Dataset:
         return EnvState.load(path)
 
 
-@process.typed("dataset")
+@reader("dataset")
 def read_dataset(
     folder: str | os.PathLike[str], *, keys: Collection[str] | None = None, max_bytes: int = 4 << 30
 ) -> Dataset:

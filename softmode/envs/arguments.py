@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import difflib
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import gymnasium as gym
 import numpy as np
@@ -13,12 +15,10 @@ import warp as wp
 from numpy.typing import NDArray
 
 from softmode.checks import require_choice
-from softmode.envs.robots import with_robot
+from softmode.envs.robots import Robot, with_robot
 from softmode.envs.task_config import ObservationType, TaskConfig
 from softmode.errors import ConfigError
 from softmode.objects.config import ObjectConfig
-from softmode.robots.description import RobotDescription
-from softmode.robots.table_robot import TableRobot
 
 CONTROL_MODES = ("pose_delta", "joint_delta")
 RENDER_MODES = ("rgb_array",)
@@ -40,23 +40,28 @@ class Shortcuts:
     """Longest edge of the object [m]."""
     preset: str | None = None
     """Named variant of the task, instead of a configuration."""
-    robot: str | Path | RobotDescription | TableRobot | None = None
-    """Robot instead of the built-in arm: a name, a file, or a loaded one."""
+    robot: Robot | None = None
+    """Robot instead of the built-in arm: a name, a file, arguments of `softmode.robots.load`, or a loaded one."""
 
 
 def checked_config(
-    wanted: type[TaskConfig], config: TaskConfig | None, given: Shortcuts, any_robot: bool = True
+    wanted: type[TaskConfig],
+    config: TaskConfig | None,
+    given: Shortcuts,
+    any_robot: bool = True,
+    values: Mapping[str, Any] | None = None,
 ) -> TaskConfig:
-    """Return the configuration with the constructor's shortcuts applied.
+    """Return the configuration with the constructor's fields and shortcuts applied.
 
     Args:
         wanted: Class of the configuration.
         config: The configuration, or None for the preset or the default.
         given: The shortcuts.
         any_robot: Whether the task plays with robots from files.
+        values: Fields of the configuration, which replace those that it has.
 
     Raises:
-        ConfigError: If an option is unknown, or the configuration of another task.
+        ConfigError: If an option or a field is unknown, or the configuration of another task.
     """
     require_choice("obs_type", given.obs_type, get_args(ObservationType))
     require_choice("render_mode", given.render_mode, (*RENDER_MODES, None))
@@ -68,6 +73,7 @@ def checked_config(
         raise ConfigError(f"preset {given.preset!r} and config exclude each other", hint="give one of them")
     if config is None:
         config = wanted() if given.preset is None else wanted.preset(given.preset)
+    config = _with_fields(config, values or {})
     scene = config.scene
     if given.control_mode is not None:
         scene = replace(scene, control=replace(scene.control, mode=given.control_mode))  # type: ignore[arg-type]
@@ -81,11 +87,28 @@ def checked_config(
     if given.robot is None:
         return config
     if not any_robot:
+        low, high = config.scene.control.workspace_lower, config.scene.control.workspace_upper
+        far = math.hypot(max(abs(low[0]), abs(high[0])), max(abs(low[1]), abs(high[1])))
         raise ConfigError(
-            f"robot given for a task of {wanted.__name__}, which plays with the built-in arm only",
-            hint="LiftSoft, PushSoft and PressSoft take any robot; docs/howto/own_robot.md has a scene of your own",
+            f"robot given for a task of {wanted.__name__}, which plays with the built-in arm only: it needs a reach "
+            f"of {far:.2f} m along the table with the tool {low[2]:.2f} to {high[2]:.2f} m above it",
+            hint="LiftSoft, PushSoft, PressSoft and PlaceInBin take any robot; docs/howto/own_robot.md has a scene of "
+            "your own",
         )
     return with_robot(config, given.robot)
+
+
+def _with_fields(config: TaskConfig, values: Mapping[str, Any]) -> TaskConfig:
+    """Return a configuration with other values of fields."""
+    known = {field.name for field in fields(config)}
+    for name in sorted(set(values) - known):
+        like = difflib.get_close_matches(name, sorted(known | {field.name for field in fields(Shortcuts)}), cutoff=0.4)
+        near = f"Nearest: {', '.join(like)}. " if like else ""
+        raise ConfigError(
+            f"{name!r} is no option of the environment and no field of {type(config).__name__}",
+            hint=f"{near}Fields: {', '.join(sorted(known))}",
+        )
+    return replace(config, **values) if values else config
 
 
 def _with_splat(thing: ObjectConfig, given: Shortcuts) -> ObjectConfig:

@@ -2,32 +2,23 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal, get_args
+from typing import Any, ClassVar
 
 import numpy as np
 import warp as wp
 
-from softmode.checks import require_choice
 from softmode.deformables.model.structs import filled
 from softmode.envs import goal_kernels as kernels
 from softmode.envs.goals import GoalMethods
 from softmode.envs.observation import PROPRIOCEPTION, Segment
 from softmode.envs.task import Task
 
-GoalReward = Literal["sparse", "distance"]
-"""What is paid: 0 at the goal and -1 elsewhere, or minus the distance in metres."""
-
 
 def goal_rules(config: Any, goal_size: int) -> Any:
     """Return what the reward depends on beside the goals, of a configuration with the fields of `PositionGoals`."""
-    sparse = int(config.reward == "sparse")
+    sparse = int(config.reward_mode == "sparse")
     arm_size = sum(segment.size for segment in PROPRIOCEPTION)
     return filled(kernels.GoalRules, config, goal_size=goal_size, sparse=sparse, arm_size=arm_size)
-
-
-def check_goal_reward(reward: object) -> None:
-    """Raise ConfigError unless it is a `GoalReward`."""
-    require_choice("reward", reward, get_args(GoalReward))
 
 
 class PositionGoals(Task):

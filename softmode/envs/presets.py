@@ -1,6 +1,6 @@
 """The table scene as reinforcement learning wants it: coarser, steps of 1/120 s, the same physics within a few percent.
 
-What it costs in accuracy stands in docs/performance.md ("A preset for reinforcement learning").
+What it costs in accuracy stands in benchmarks/JOURNAL.md ("A preset for reinforcement learning").
 """
 
 from dataclasses import replace

@@ -35,6 +35,7 @@ def info_arrays(task: Task, *, final: bool = False) -> dict[str, Tree]:
     return {
         **which,
         "is_success": success,
+        "success": success,
         "reward_terms": {name: columns_of(task.terms, k) for k, name in enumerate(task.term_names)},
         **{name: columns_of(metrics, k) for k, name in enumerate(task.metric_names)},
         "parameters": {

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
 import math
+from collections.abc import Mapping
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -19,6 +21,8 @@ from softmode.robots.loading import load
 from softmode.robots.table_robot import TableRobot, place_robot, tip_length
 
 Config = TypeVar("Config", bound=TaskConfig)
+Robot = str | Path | Mapping[str, Any] | RobotDescription | TableRobot
+"""How a robot is given: a name, a file, arguments of `softmode.robots.load` by name, loaded, or at the table."""
 
 _TOP = 0.17
 """Height that every tool is to reach where the workspace allows it: over what stands on the table [m]."""
@@ -40,7 +44,23 @@ def _sampled_for(thing: ObjectConfig, jaw: ParallelJaw) -> ObjectConfig:
     return replace(thing, surface_count=max(thing.surface_count, min(wanted, _MOST_SAMPLES)))
 
 
-def with_robot(config: Config, robot: str | Path | RobotDescription | TableRobot) -> Config:
+def loaded(robot: Robot) -> RobotDescription | TableRobot:
+    """Return a robot that is named, or given by a file or the arguments of `softmode.robots.load`.
+
+    Raises:
+        ConfigError: If it is none of that, or an argument is unknown.
+        AssetError: If it cannot be loaded.
+    """
+    if isinstance(robot, Mapping):
+        unknown = set(robot) - set(inspect.signature(load).parameters)
+        if unknown or "source" not in robot:
+            hint = "give source, and further arguments of softmode.robots.load"
+            raise ConfigError(f"robot has {sorted(unknown) or 'no source'}", hint=hint)
+        return load(**robot)
+    return load(robot) if isinstance(robot, (str, Path)) else robot
+
+
+def with_robot(config: Config, robot: Robot) -> Config:
     """Return a task's configuration with another robot.
 
     A robot that is not at the table yet is placed so that its tool reaches, pointing down, the home position of the
@@ -49,7 +69,7 @@ def with_robot(config: Config, robot: str | Path | RobotDescription | TableRobot
 
     Args:
         config: The configuration.
-        robot: A name, a file, a loaded robot, or one at the table.
+        robot: A name, a file, the arguments of `softmode.robots.load` by name, a loaded robot, or one at the table.
 
     Raises:
         ConfigError: If the robot has no gripper of two fingers, or cannot reach the table.
@@ -57,8 +77,7 @@ def with_robot(config: Config, robot: str | Path | RobotDescription | TableRobot
     """
     scene = config.scene
     arm = scene.arm if isinstance(scene.arm, ArmDescription) else ArmDescription()
-    if isinstance(robot, (str, Path)):
-        robot = load(robot)
+    robot = loaded(robot)
     if isinstance(robot, RobotDescription):
         (dx, dy), goal = config.position_range, getattr(config, "goal_range", (0.0, 0.0, 0.0))
         goal = (*(max(side, getattr(config, "goal_distance", (0.0, 0.0))[1]) for side in goal[:2]), *goal[2:])
@@ -73,6 +92,7 @@ def with_robot(config: Config, robot: str | Path | RobotDescription | TableRobot
             over=scene.object_position,
             ranges=(max(dx, goal[0]) + 0.03, max(dy, goal[1]) + 0.03),
             height=max(rise + 0.06, z, min(scene.control.workspace_upper[2], _TOP)),
+            also=config.spots(),
         )
         if config.tool_stiffness is not None:
             robot = robot.with_tool_stiffness(config.tool_stiffness)
@@ -86,12 +106,13 @@ def with_robot(config: Config, robot: str | Path | RobotDescription | TableRobot
         control = replace(control, workspace_lower=lower, workspace_upper=upper)
     # Loops and joint limits of a gripper take rows of their own.
     more = len(robot.robot.joint_names) + 6 * robot.robot.mjcf.count("<connect")
+    shapes = int(np.count_nonzero(robot.robot.model.geom_contype))
     scene = replace(
         scene,
         arm=robot,
         control=control,
         constraint_max=max(scene.constraint_max, 64) + 2 * more,
-        rigid_contact_max=max(scene.rigid_contact_max, 64),
+        rigid_contact_max=max(scene.rigid_contact_max, 64) + 3 * shapes,  # pairs that come near count as well
     )
     if config.samples_for_tips:
         scene = replace(scene, object=_sampled_for(scene.object, robot.jaw))

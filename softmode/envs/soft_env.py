@@ -34,13 +34,12 @@ from softmode.envs.env_state import (
 )
 from softmode.envs.parameters import check_options
 from softmode.envs.results import host_view, info_arrays, name_of, observation_arrays, take, write
+from softmode.envs.robots import Robot
 from softmode.envs.task import Task
 from softmode.envs.task_config import ObservationType, TaskConfig
 from softmode.envs.tensors import map_tree
 from softmode.errors import ConfigError
 from softmode.pause import collector_paused
-from softmode.robots.description import RobotDescription
-from softmode.robots.table_robot import TableRobot
 
 
 class SoftEnv(gym.Env, gym.utils.EzPickle):
@@ -82,11 +81,12 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
         splat: Splat file of the object; None for the built-in one.
         size: Longest edge of the object [m].
         preset: Named variant of the task, instead of `config`.
-        robot: Robot instead of the built-in arm: a name of `softmode.robots.available`, a file, a `RobotDescription`,
-            or a `TableRobot` that `softmode.robots.place_robot` put at the table.
+        robot: Robot instead of the built-in arm: a name of `softmode.robots.available`, a file, arguments of
+            `softmode.robots.load` by name, a `RobotDescription`, or a `TableRobot` of `softmode.robots.place_robot`.
         config: Everything else.
         device: Warp device.
         progress: Reports the build of the object: a callable (stage, fraction), or True or False for a bar or none.
+        fields: Fields of the configuration, such as ``image_size=64``; they replace those of `config`.
 
     Raises:
         ConfigError: If an option is unknown or out of range, or there is no such device.
@@ -106,10 +106,11 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
         splat: str | Path | None = None,
         size: float | None = None,
         preset: str | None = None,
-        robot: str | Path | RobotDescription | TableRobot | None = None,
+        robot: Robot | None = None,
         config: TaskConfig | None = None,
         device: wp.DeviceLike = None,
         progress: bool | Progress | None = None,
+        **fields: Any,
     ) -> None:
         """Build the scene and the spaces."""
         given = Shortcuts(
@@ -123,8 +124,8 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
         )
         # What a copy is made from when the environment is pickled; a callback cannot travel.
         place = None if device is None else str(device)
-        gym.utils.EzPickle.__init__(self, **vars(given), config=config, device=place)
-        self.config = checked_config(self.task_class.config_class, config, given, self.task_class.any_robot)
+        gym.utils.EzPickle.__init__(self, **vars(given), config=config, device=place, **fields)
+        self.config = checked_config(self.task_class.config_class, config, given, self.task_class.any_robot, fields)
         self.obs_type, self.render_mode = obs_type, render_mode
         self.metadata = {**self.metadata, "render_fps": round(self.config.scene.control_hz)}
         with collector_paused():
@@ -136,6 +137,8 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
                 progress=progress,
             )
         self.scene, self.device = self.task.scene, self.task.device
+        self._begun = False
+        """Whether an episode has begun."""
         self._object_names = () if self.config.object_set is None else self.config.object_set.names
         self.action_space = self.task.action_space
         self.observation_space = self.task.observation_space()
@@ -147,6 +150,7 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
     def reset(self, *, seed: int | None = None, options: Mapping[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode."""
         given = checked_options(options)
+        self._begun = True
         if "state" in given:
             if seed is not None or len(given) > 1:
                 raise ConfigError(
@@ -166,8 +170,10 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
         """Advance one control step.
 
         Raises:
-            ConfigError: If the action has another shape or holds NaN; nothing has moved then.
+            ConfigError: If the action has another shape or holds NaN, or no episode has begun; nothing has moved then.
         """
+        if not self._begun:
+            raise ConfigError("step comes before the first reset", hint="call reset() first")
         given = checked_actions(action, self.action_space)[None]
         actions, _, _, *ends = self._arrays
         write(given, actions)
@@ -202,6 +208,7 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
         if state.world_count != 1:
             raise ConfigError(f"the state has {state.world_count} worlds", hint="choose one with state.worlds([0])")
         random = generator_of(state.random[0])
+        self._begun = True
         set_worlds_state(self.task, state.owner, state.arrays, np.ones(1, bool))
         self._np_random = random
 

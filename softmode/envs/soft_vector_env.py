@@ -32,13 +32,12 @@ from softmode.envs.arguments import (
 from softmode.envs.env_state import EnvState, checked_state, generator_of, generator_state
 from softmode.envs.parameters import check_options
 from softmode.envs.results import add_object_names, named_reasons
+from softmode.envs.robots import Robot
 from softmode.envs.task import Task
 from softmode.envs.task_config import ObservationType, TaskConfig
 from softmode.envs.tensors import Tensor, host_array, map_tree
 from softmode.envs.worlds import LocalWorlds, RemoteWorlds
 from softmode.errors import ConfigError, MissingExtraError
-from softmode.robots.description import RobotDescription
-from softmode.robots.table_robot import TableRobot
 
 Output = Literal["numpy", "torch"]
 
@@ -61,8 +60,8 @@ class SoftVectorEnv(gym.vector.VectorEnv):
         splat: Splat file of the object; None for the built-in one.
         size: Longest edge of the object [m].
         preset: Named variant of the task, instead of `config`.
-        robot: Robot instead of the built-in arm: a name of `softmode.robots.available`, a file, a `RobotDescription`,
-            or a `TableRobot` that `softmode.robots.place_robot` put at the table.
+        robot: Robot instead of the built-in arm: a name of `softmode.robots.available`, a file, arguments of
+            `softmode.robots.load` by name, a `RobotDescription`, or a `TableRobot` of `softmode.robots.place_robot`.
         config: Everything else.
         max_episode_steps: Control steps after which an episode is truncated; None for never.
         autoreset_mode: When the next episode of a world begins.
@@ -71,6 +70,7 @@ class SoftVectorEnv(gym.vector.VectorEnv):
         processes: Child processes that share the worlds on CPU, each on its own core; 1 keeps them in this process.
         device: Warp device; the default one if None.
         progress: Reports the build of the object.
+        fields: Fields of the configuration, such as ``image_size=64``; they replace those of `config`.
 
     Raises:
         ConfigError: If an option is unknown or out of range, or there is no such device.
@@ -91,7 +91,7 @@ class SoftVectorEnv(gym.vector.VectorEnv):
         splat: str | Path | None = None,
         size: float | None = None,
         preset: str | None = None,
-        robot: str | Path | RobotDescription | TableRobot | None = None,
+        robot: Robot | None = None,
         config: TaskConfig | None = None,
         max_episode_steps: int | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
@@ -99,6 +99,7 @@ class SoftVectorEnv(gym.vector.VectorEnv):
         processes: int = 1,
         device: wp.DeviceLike = None,
         progress: bool | Progress | None = None,
+        **fields: Any,
     ) -> None:
         """Build the scene, capture the step and make the spaces."""
         self._arguments = {
@@ -116,6 +117,7 @@ class SoftVectorEnv(gym.vector.VectorEnv):
             "output": output,
             "processes": processes,
             "device": device,
+            **fields,
         }
         """What a copy is made from; a callback is not."""
         self.num_envs = checked_count("num_envs", num_envs)
@@ -136,7 +138,7 @@ class SoftVectorEnv(gym.vector.VectorEnv):
             preset=preset,
             robot=robot,
         )
-        config = checked_config(self.task_class.config_class, config, given, self.task_class.any_robot)
+        config = checked_config(self.task_class.config_class, config, given, self.task_class.any_robot, fields)
         if output == "torch":
             try:
                 import torch  # noqa: F401

@@ -77,7 +77,7 @@ class Task:
         final_observation: That at the end of the last episode, before the reset of SAME_STEP.
         terms: Reward terms, shape (world_count, T), `term_names`.
         metrics: Task-specific figures, shape (world_count, M), `metric_names`.
-        reward: Sum of the terms, shape (world_count,).
+        reward: Sum of the terms, or as `TaskConfig.reward_mode` says, shape (world_count,).
         terminated: Whether the episode ended by a failure.
         truncated: Whether it ended by its limit.
         success: Whether the task counts as solved now.
@@ -742,7 +742,8 @@ class Task:
         self.evaluate()
         status, lowest = scene.solver.status, self._lowest
         not_finite = bits.WORLD_NOT_FINITE | bits.WORLD_RIGID_NOT_FINITE
-        inputs = [fresh, self.limit, not_finite, status, self.finite, self.state, lowest]
+        sparse = int(self.config.reward_mode == "sparse" and not self.config.terms_follow_mode)
+        inputs = [fresh, self.limit, sparse, not_finite, status, self.finite, self.state, lowest]
         self.launch(kernels.finish_step, inputs, [self.result, self._episode])
 
     def _keep_pictures(self) -> None:

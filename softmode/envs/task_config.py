@@ -16,6 +16,7 @@ from softmode.splats.camera_randomization import CameraRandomization
 ObservationType = Literal["state", "pixels", "pixels_agent_pos"]
 CameraName = Literal["front", "wrist"]
 ImageOutput = Literal["depth", "segmentation"]
+RewardMode = Literal["dense", "sparse"]
 
 _RANGES: dict[str, dict[str, float]] = {
     "youngs_modulus_range": {"above": 0.0},
@@ -25,6 +26,9 @@ _RANGES: dict[str, dict[str, float]] = {
     "scale_range": {"above": 0.49, "below": 2.01},
 }
 """Limits of the ranges that may be None."""
+
+_SIZES = (0.005, 1.0)
+"""Least and largest longest edge of a file's object on a table [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,8 +44,15 @@ class TaskConfig:
     """Vertical stiffness that the drives of another robot are to have at its tool in the home pose [N/m]; None keeps
     them."""
 
+    reward_modes: ClassVar[tuple[str, ...]] = get_args(RewardMode)
+    """What `reward_mode` may be."""
+    terms_follow_mode: ClassVar[bool] = False
+    """Whether the reward's terms are those of the mode; else "sparse" pays 1 for success in place of their sum."""
+
     scene: TableSceneConfig = field(default_factory=TableSceneConfig)
     """Objects, robot and physics."""
+    reward_mode: str = "dense"
+    """"dense": the sum of the reward's terms; "sparse": 1 where the task counts as solved, 0 elsewhere."""
     objects: ObjectSet | None = None
     """Objects of which every world gets one, or several, in place of `scene.object`; material properties without a
     range are those of the object, the range of another property holds for all."""
@@ -79,6 +90,7 @@ class TaskConfig:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
+        require_choice("reward_mode", self.reward_mode, self.reward_modes)
         if self.objects is not None and not isinstance(self.objects, ObjectSet):
             raise ConfigError(f"objects is a {type(self.objects).__name__}", hint="give an ObjectSet([...])")
         if self.objects is not None and self.scene.objects is not None and self.objects != self.scene.objects:
@@ -97,6 +109,11 @@ class TaskConfig:
         require_number("image_size", self.image_size, at_least=36, at_most=640, unit="px")
         require_number("render_size", self.render_size, at_least=64, at_most=1024, unit="px")
         require_choice("mesh_samples", self.mesh_samples, (1, 4))
+        for thing in (self.scene.object, *self.scene.others):
+            hint = "a table and its gripper take 5 mm to 1 m; larger and smaller bodies are for scenes of your own"
+            if thing.longest_edge is not None:
+                low, high = _SIZES
+                require_number("an object's size", thing.longest_edge, at_least=low, at_most=high, unit="m", hint=hint)
 
     @property
     def object_set(self) -> ObjectSet | None:
@@ -114,6 +131,10 @@ class TaskConfig:
             return self
         moved = replace(given, first_world=given.first_world + first)
         return replace(self, objects=moved, scene=replace(self.scene, objects=None))
+
+    def spots(self) -> tuple[tuple[float, float, float], ...]:
+        """Return places that a robot must reach beside the random ones [m]: the task does not move them."""
+        return ()
 
     @classmethod
     def preset(cls, name: str) -> Self:

@@ -344,6 +344,7 @@ def forget(
 def finish_step(
     fresh: wp.array[wp.bool],  # worlds whose step was a reset
     limit: int,  # steps per episode, 0 for none
+    sparse: int,  # whether success is paid, and not the terms
     not_finite: int,  # status bits
     status: wp.array[int],
     finite: wp.array[wp.bool],
@@ -366,6 +367,8 @@ def finish_step(
         if not (played and wp.isfinite(result.terms[w, t])):
             result.terms[w, t] = 0.0
         total += result.terms[w, t]
+    if sparse != 0:
+        total = wp.where(played and result.success[w], 1.0, 0.0)
     if played:
         episode.elapsed[w] += 1
     else:

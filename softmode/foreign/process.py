@@ -10,9 +10,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
-import functools
 import importlib.util
-import inspect
 import json
 import os
 import re
@@ -21,19 +19,17 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.errors import AssetError, MissingExtraError, SoftmodeError
-from softmode.foreign.child.limits import Refused
+from softmode.errors import AssetError, MissingExtraError
+from softmode.files import REEXPORT
+from softmode.foreign.child.layers import inside
 
-REEXPORT = "The file is damaged or incomplete: copy or export it again"
-"""The remedy for a file that contradicts itself."""
 _LIGHTEN = "If the file is damaged, copy or export it again; if it is merely large, import a part of it"
 _CHILD = Path(__file__).with_name("child") / "__main__.py"
 _KINDS = tuple("fediIlqLQB?")
@@ -41,8 +37,6 @@ _KINDS = tuple("fediIlqLQB?")
 _LIBRARIES = {"mesh": "trimesh", "model": "mujoco", "table": "pyarrow"}
 """Package that a reader needs; the others read stages."""
 _SHOWN = {"pxr": "OpenUSD", "mujoco": "MuJoCo"}
-_P = ParamSpec("_P")
-_T = TypeVar("_T")
 _lock = threading.RLock()
 _kept: tuple[int, subprocess.Popen[str]] | None = None
 """The process that is kept, and the process that it belongs to: a fork starts one of its own."""
@@ -72,46 +66,6 @@ class Answer:
     """The arrays."""
 
 
-@contextlib.contextmanager
-def invalid_data(name: str) -> Iterator[None]:
-    """Turn whatever contradictory data leads code to into an AssetError that names the file.
-
-    Args:
-        name: The file as messages call it.
-    """
-    try:
-        yield
-    except (SoftmodeError, Warning):
-        raise
-    except Refused as error:
-        raise AssetError(f"{name}: {error}", hint=error.hint) from error
-    except Exception as error:
-        raise AssetError(
-            f"{name}: holds invalid data ({type(error).__name__}: {str(error)[:300]})", hint=REEXPORT
-        ) from error
-
-
-def typed(what: str) -> Callable[[Callable[_P, _T]], Callable[_P, _T]]:
-    """Decorate a reader: whatever it raises, once called rightly, becomes an AssetError that names its first argument.
-
-    Args:
-        what: What is read, as messages call it.
-    """
-
-    def decorate(function: Callable[_P, _T]) -> Callable[_P, _T]:
-        signature = inspect.signature(function)
-
-        @functools.wraps(function)
-        def wrapped(*args: _P.args, **options: _P.kwargs) -> _T:
-            given = signature.bind(*args, **options).arguments
-            with invalid_data(f"{what} {next(iter(given.values()))}"):
-                return function(*args, **options)
-
-        return wrapped
-
-    return decorate
-
-
 def library_folder(library: str = "pxr") -> str:
     """Return the folder that holds a package without importing it.
 
@@ -130,82 +84,44 @@ def read(
     *,
     name: str,
     asset_root: str | os.PathLike[str] | None = None,
+    limits: Limits | None = None,
     **options: Any,
 ) -> Answer:
-    """Have a file read; see `make_request` and `ask`.
-
-    Args:
-        what: Name of the reader.
-        path: The file.
-        name: The file as messages call it.
-        asset_root: Folder that holds whatever the file may refer to; None for the file's own.
-        **options: What the reader needs beside.
-
-    Raises:
-        AssetError: If the file is missing, damaged, breaks a rule, or takes more than it may.
-    """
-    with tempfile.TemporaryDirectory() as folder:
-        request = make_request(what, path, os.path.join(folder, "answer"), asset_root=asset_root, limits=Limits())
-        return ask(request | options, name=name)
-
-
-def make_request(
-    what: str, path: str | os.PathLike[str], answer: str, *, asset_root: str | os.PathLike[str] | None, limits: Limits
-) -> dict[str, Any]:
-    """Return a request as the process takes it; readers add what they need.
+    """Have a file read by the process, which is started if there is none, and return what it answers.
 
     Args:
         what: Name of the reader: a module of `softmode.foreign.child`.
         path: The file.
-        answer: Where the answer goes.
+        name: The file as messages call it.
         asset_root: Folder that holds whatever the file may refer to; None for the file's own.
-        limits: What the process may take.
+        limits: What the process may take; those of `Limits` if None.
+        **options: What the reader needs beside.
 
     Raises:
-        AssetError: If the file is missing or lies outside the root.
+        AssetError: If the file is missing, damaged, lies outside the root, breaks a rule, or makes the library exceed
+            its memory or time.
         MissingExtraError: If the file is a stage and the extra `[usd]` is not installed.
     """
     library = _LIBRARIES.get(what, "pxr")
-    shown = "OpenUSD file" if library == "pxr" else "file"
+    shown = _SHOWN.get(library, library)
     file = os.path.abspath(path)
     root = os.path.dirname(file) if asset_root is None else os.path.abspath(asset_root)
     if not os.path.isfile(file):
-        raise AssetError(f"{shown} {path}: cannot be read (no such file)", hint="Check the path")
-    if asset_root is not None and not Path(os.path.realpath(file)).is_relative_to(os.path.realpath(root)):
-        raise AssetError(f"{shown} {path}: lies outside asset_root {asset_root}", hint="Pass a folder that holds it")
-    return {
-        "library": library,
-        "place": library_folder(library),
-        "what": what,
-        "file": file,
-        "root": root,
-        "answer": answer,
-        "limits": asdict(limits),
-        "strict": False,
-    }
-
-
-def ask(request: dict[str, Any], *, name: str) -> Answer:
-    """Send a request to the process that reads, which is started if there is none, and return what it answers.
-
-    Args:
-        request: From `make_request`, with what the reader needs added.
-        name: The file as messages call it.
-
-    Raises:
-        AssetError: If the file is damaged, breaks a rule, or makes the library exceed its memory or time.
-    """
-    limits, size = request["limits"], os.stat(request["file"]).st_size + request.get("size", 0)
-    wall = 12.0 * (limits["seconds"] + limits["seconds_per_byte"] * size)
-    shown = str(_SHOWN.get(request["library"], request["library"]))
-    with tempfile.TemporaryDirectory() as scratch:
-        report = os.path.join(scratch, "errors")
-        code = _run(json.dumps(request | {"errors": report, "folder": scratch}), wall)
+        raise AssetError(f"{name}: cannot be read (no such file)", hint="Check the path")
+    if asset_root is not None and not inside(file, root):
+        raise AssetError(f"{name}: lies outside asset_root {asset_root}", hint="Pass a folder that holds it")
+    limits = Limits() if limits is None else limits
+    wall = 12.0 * (limits.seconds + limits.seconds_per_byte * (os.stat(file).st_size + options.get("size", 0)))
+    request = {"library": library, "place": library_folder(library), "what": what, "file": file, "root": root}
+    with tempfile.TemporaryDirectory() as folder:
+        answer, report = os.path.join(folder, "answer"), os.path.join(folder, "errors")
+        request |= {"answer": answer, "errors": report, "folder": folder, "limits": asdict(limits), "strict": False}
+        code = _run(json.dumps(request | options), wall)
         if code is None:
             raise AssetError(f"{name}: {shown} does not come to an end with it", hint=_LIGHTEN)
         if code:
             raise refusal(code, _tail(report), name, shown)
-    return read_answer(request["answer"], name)
+        return read_answer(answer, name)
 
 
 def _run(line: str, wall: float) -> int | None:

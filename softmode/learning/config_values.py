@@ -85,8 +85,9 @@ def split_config(env: str, options: dict[str, Any]) -> tuple[TaskConfig, dict[st
     kind = config_class(env)
     rest = with_config(env, options)
     shortcuts = Shortcuts(**{name: rest[name] for name in _SHORTCUTS if name in rest})
-    config = checked_config(kind, rest.get("config"), shortcuts)
-    return config, {name: value for name, value in rest.items() if name not in (*_SHORTCUTS, "config")}
+    fields = {field.name: rest[field.name] for field in dataclasses.fields(kind) if field.name in rest}
+    config = checked_config(kind, rest.get("config"), shortcuts, values=fields)
+    return config, {name: value for name, value in rest.items() if name not in (*_SHORTCUTS, "config", *fields)}
 
 
 def joined_config(env: str, config: TaskConfig, rest: dict[str, Any]) -> dict[str, Any]:

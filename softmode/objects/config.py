@@ -137,7 +137,7 @@ class ObjectConfig:
         object.__setattr__(self, "density_colors", tuple(self.density_colors))
         if self.size is not None:
             hint = "give the longest edge in metres"
-            require_number("size", self.size, at_least=0.005, at_most=1.0, unit="m", hint=hint)
+            require_number("size", self.size, at_least=1.0e-3, at_most=10.0, unit="m", hint=hint)
         if self.preset is not None:
             find_preset(self.preset)
         require_fields(self, ("contact_radius", "clamped_height"), at_least=0.0, unit="m")
@@ -268,8 +268,8 @@ class ObjectConfig:
             raise ConfigError(f"shape {self.shape!r} with extents {self.extents}", hint=hint)
         if self.extents is None or self.shape == "plush":
             return
-        if len(self.extents) != 3 or not all(1.0e-3 <= x <= 2.0 for x in self.extents):
-            raise ConfigError(f"extents must be three lengths in 0.001..2 m, got {self.extents!r}")
+        if len(self.extents) != 3 or not all(1.0e-3 <= x <= 10.0 for x in self.extents):
+            raise ConfigError(f"extents must be three lengths in 0.001..10 m, got {self.extents!r}")
         if find_axis(self.shape, self.extents) is None:
             hint = "give a sphere three equal lengths, a cylinder two, a capsule two and a third not below them"
             raise ConfigError(f"extents {self.extents} are not those of a {self.shape}", hint=hint)

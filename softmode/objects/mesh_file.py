@@ -6,12 +6,12 @@ import os
 from pathlib import Path
 
 from softmode.errors import AssetError
-from softmode.files import require_content
+from softmode.files import reader, require_content
 from softmode.foreign import process, tokens
 from softmode.splats.colored_mesh import ColoredMesh
 
 
-@process.typed("mesh file")
+@reader("mesh file")
 def read_mesh(path: str | os.PathLike[str]) -> ColoredMesh:
     """Read a mesh file of any kind that trimesh reads (.obj, .glb, .gltf, .ply, .stl, .off, ...), with its textures.
 
@@ -34,4 +34,6 @@ def read_mesh(path: str | os.PathLike[str]) -> ColoredMesh:
     require_content(file, "mesh file")
     answer = process.read("mesh", file, name=name, want="colors")
     textures = tuple(answer.arrays[k] for k in answer.described.pop("textures"))
-    return ColoredMesh(**{key: answer.arrays[k] for key, k in answer.described.items()}, textures=textures, name=name)
+    x, y, z = answer.described.pop("offset")
+    arrays = {key: answer.arrays[k] for key, k in answer.described.items()}
+    return ColoredMesh(**arrays, textures=textures, name=name, offset=(x, y, z))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import json
 import os
 from dataclasses import replace
@@ -20,6 +21,7 @@ from softmode.objects.soft_object import SoftObject
 from softmode.radiance.formats import is_radiance
 from softmode.radiance.grid import RadianceGrid
 from softmode.splats.formats import READABLE
+from softmode.splats.formats.others import refuse_others
 from softmode.splats.point_cloud import ply_kind, splats_from_points
 from softmode.splats.splats import Splats
 
@@ -96,12 +98,15 @@ def file_kind(path: str | os.PathLike[str]) -> FileKind:
     with damage_errors(f"file {file}", hint="check the path"):
         exists = file.exists()
     if not exists:
+        like = difflib.get_close_matches(file.name, PRESETS, n=len(PRESETS), cutoff=0.5)
+        presets = ", ".join([*like, *(name for name in PRESETS if name not in like)])
         named = len(file.parts) == 1 and not file.suffix
-        hint = f"check the path, or name a preset: {', '.join(PRESETS)}" if named else "check the path"
+        hint = f"check the path, or name a preset: {presets}" if named else "check the path"
         raise AssetError(f"file {file}: no such file", hint=hint)
     suffix = file.suffix.lower()
     if is_radiance(file):
         return "radiance"
+    refuse_others(file)
     if suffix == ".npz":
         names = array_names(file, hint="build or write it again")
         return "points" if "points" in names and "header" not in names else "body"

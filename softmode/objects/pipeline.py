@@ -32,7 +32,7 @@ from softmode.splats.splats import Splats
 
 Array = NDArray[np.float64]
 
-RECIPE = 7
+RECIPE = 8
 """Part of the cache key; raise it when the way from a file or shape to a body changes."""
 SIZE_TOLERANCE = 0.02
 """Relative error of the size of a fill that is left: bumps of that height lie on its surface."""
@@ -175,6 +175,10 @@ def dressed(body: ReducedBody, config: ObjectConfig, source: ObjectSource, mater
         "asset_splats": source.asset_splats,
         "asset_left_out": source.asset_splats - splats.count,
     }
+    if any(source.offset):
+        told["asset_offset"] = json.dumps(source.offset)
+    if source.notes:
+        told["asset_notes"] = "; ".join(source.notes)
     if config.preset is not None:
         told["material"] = json.dumps(find_preset(config.preset).properties)
     factor, field = float(np.cbrt(np.linalg.det(turn))), source.radiance
@@ -185,6 +189,7 @@ def dressed(body: ReducedBody, config: ObjectConfig, source: ObjectSource, mater
         contact_radius=config.contact_radius,
         config=config,
         radiance=None if field is None else field.transformed(turn / factor, -body.offset, factor),
+        notes=source.notes,
     )
 
 

@@ -38,6 +38,7 @@ from softmode.radiance.grid import RadianceGrid
 from softmode.splats import plush
 from softmode.splats.colored_mesh import ColoredMesh
 from softmode.splats.formats import read_splats
+from softmode.splats.formats.common import offset_note
 from softmode.splats.point_cloud import is_point_cloud, read_points
 from softmode.splats.splats import Splats, up_rotation
 
@@ -69,6 +70,10 @@ class ObjectSource:
     """Its radiance field, where the splats are."""
     capture: dict[str, str | int | float] = field(default_factory=dict)
     """What was found in its file beside it, for the report."""
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """What was taken off the coordinates of its file, which are too far out for float32 [m]."""
+    notes: tuple[str, ...] = ()
+    """What was read from its file in another way than it was meant."""
 
 
 def object_source(config: ObjectConfig) -> ObjectSource:
@@ -102,7 +107,8 @@ def _cached_splats(key: tuple[object, ...], name: str, make: Callable[[], Splats
     fields = ("means", "quats", "scales", "opacities", "sh")
 
     def read(path: Path) -> Splats:
-        return Splats(**read_archive(path, "softmode.baked", 1)[1], name=name)
+        arrays: dict[str, Any] = read_archive(path, "softmode.baked", 1)[1]
+        return Splats(**arrays, name=name)
 
     def write(splats: Splats, path: Path) -> None:
         write_archive(
@@ -120,10 +126,12 @@ def _upright_mesh(config: ObjectConfig, given: str | Path | ColoredMesh) -> Colo
     else:
         mesh = read_mesh(given)
         up = "+y" if Path(given).suffix.lower() in (".glb", ".gltf") else up
-    corners = mesh.corners.astype(np.float64) @ up_rotation(config.up or up).T
+    turn = up_rotation(config.up or up)
+    corners = mesh.corners.astype(np.float64) @ turn.T
     bounds = np.stack([corners.min(axis=(0, 1)), corners.max(axis=(0, 1))])
     scale = 1.0 if config.longest_edge is None else config.longest_edge / np.ptp(bounds, axis=0).max()
-    return replace(mesh, corners=((corners - seat_of(bounds)) * scale).astype(np.float32))
+    x, y, z = (turn @ mesh.offset).tolist()
+    return replace(mesh, corners=((corners - seat_of(bounds)) * scale).astype(np.float32), offset=(x, y, z))
 
 
 def _preset_source(config: ObjectConfig, name: str) -> ObjectSource:
@@ -137,7 +145,8 @@ def _mesh_source(config: ObjectConfig, given: str | Path | ColoredMesh, splat_co
     splats = surface_splats(mesh, config.splat_count or splat_count, config.colors)
     name = mesh.name if isinstance(given, ColoredMesh) else Path(given).name
     solid = partial(_mesh_solid, mesh, surface_count=config.surface_count)
-    return ObjectSource(splats, solid, name, ("mesh, holes capped", mesh.corners), splats.count)
+    key, notes = ("mesh, holes capped", mesh.corners), (*mesh.notes, *offset_note(mesh.offset))
+    return ObjectSource(splats, solid, name, key, splats.count, offset=mesh.offset, notes=notes)
 
 
 def _field_source(config: ObjectConfig, given: str | Path | RadianceGrid) -> ObjectSource:
@@ -161,11 +170,12 @@ def _shape_source(shape: Primitive, config: ObjectConfig, extents: Extents) -> O
 
 def _splat_source(config: ObjectConfig, given: str | Path | Splats | None) -> ObjectSource:
     """Read splats or a point cloud; None makes the plush."""
-    splats, capture, name = _upright_splats(config, given)
+    splats, told, capture, name = _upright_splats(config, given)
     arrays = (splats.means, splats.scales, splats.quats, splats.opacities)
     solid = partial(quadrature_from_splats, *arrays, surface_count=config.surface_count, resolution=config.resolution)
     key = ("splats", *arrays, config.resolution)
-    return ObjectSource(splats, solid, name, key, int(capture["asset_splats"]), config.longest_edge, capture=capture)
+    count = int(capture["asset_splats"])
+    return ObjectSource(splats, solid, name, key, count, config.longest_edge, None, capture, told.offset, told.notes)
 
 
 def _body_source(config: ObjectConfig, given: str | Path) -> ObjectSource:
@@ -189,11 +199,11 @@ def _mesh_solid(mesh: ColoredMesh, surface_count: int) -> Quadrature:
 
 def _upright_splats(
     config: ObjectConfig, source: str | Path | Splats | None
-) -> tuple[Splats, dict[str, str | int | float], str]:
-    """Return the object's splats upright, standing on z = 0, scaled; what else there was; the name of the object."""
+) -> tuple[Splats, Splats, dict[str, str | int | float], str]:
+    """Return the object's splats upright, standing on z = 0, scaled; those of the file; what else there was; a name."""
     capture: dict[str, str | int | float] = {}
     if source is None:
-        splats = _cached_splats(("plush", getsource(plush)), "plush", plush.make_plush)
+        splats = cropped = _cached_splats(("plush", getsource(plush)), "plush", plush.make_plush)
         name, stray, given = "plush", 0.0, splats.count
     else:
         cropped, name = _cropped_splats(config, source)
@@ -210,7 +220,7 @@ def _upright_splats(
         raise AssetError(f"{splats.name}: all splats lie at one point", hint="export the asset again")
     scale = (config.longest_edge or extent) / extent
     capture["asset_splats"] = given
-    return splats.transformed(translation=-scale * seat_of(bounds), scale=scale), capture, name
+    return splats.transformed(translation=-scale * seat_of(bounds), scale=scale), cropped, capture, name
 
 
 def _cropped_splats(config: ObjectConfig, given: str | Path | Splats) -> tuple[Splats, str]:
@@ -229,9 +239,10 @@ def _cropped_splats(config: ObjectConfig, given: str | Path | Splats) -> tuple[S
     splats = splats.oriented(config.up or up)
     if config.crop is None:
         return splats, name
-    inside = (splats.means >= config.crop[:3]).all(axis=1) & (splats.means <= config.crop[3:]).all(axis=1)
+    near = np.asarray(config.crop).reshape(2, 3) - splats.offset
+    inside = (splats.means >= near[0]).all(axis=1) & (splats.means <= near[1]).all(axis=1)
     if not inside.any():
-        low, high = np.round(splats.bounds(), 3).tolist()
+        low, high = np.round(splats.bounds() + splats.offset, 3).tolist()
         hint = f"the splats fill {low} to {high} once turned up"
         raise AssetError(f"{splats.name}: no splat lies inside crop {config.crop}", hint=hint)
     return splats.subset(inside), name

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 
 from softmode.errors import AssetError
+from softmode.files import damage_errors
 from softmode.foreign import process
+from softmode.foreign.child.surface import near_zero
 from softmode.objects.soft_object import SoftObject
 from softmode.objects.stage_bundle import body_of
 from softmode.objects.stage_geometry import SurfaceMesh, mesh_surface, tet_surface
-from softmode.objects.stage_scene import parts_of, read_usd_scene, stage_frame
+from softmode.objects.stage_scene import parts_of, read_usd_scene, stage_frame, warned
 from softmode.splats.colored_mesh import ColoredMesh
 
 
@@ -54,7 +57,7 @@ def read_usd_body(path: str | os.PathLike[str]) -> SoftObject:
 def read_usd_mesh(path: str | os.PathLike[str]) -> ColoredMesh:
     """Read the visible meshes of a stage, or its tetrahedral ones where there is none, in metres with z up.
 
-    Colours are `primvars:displayColor`; textures and bound materials are not read.
+    Colours are those of UsdPreviewSurface materials, with their textures, else `primvars:displayColor`.
 
     Args:
         path: A `.usd`, `.usda`, `.usdc` or `.usdz` file.
@@ -67,7 +70,7 @@ def read_usd_mesh(path: str | os.PathLike[str]) -> ColoredMesh:
     answer = _ask(path, geometry=True)
     frame = stage_frame(answer.described, name)
     surfaces = []
-    with process.invalid_data(name):
+    with damage_errors(name):
         for prim in answer.described["meshes"]:
             where, parts = f"{name}: {prim['path']}", parts_of(prim, answer.arrays, frame)
             matrix = frame.matrix(prim["matrix"])
@@ -76,25 +79,32 @@ def read_usd_mesh(path: str | os.PathLike[str]) -> ColoredMesh:
             if prim["kind"] == "Mesh":
                 surfaces.append(mesh_surface(parts, matrix[:3, :3], where, matrix[:3, 3]))
             else:
-                tets = tet_surface(parts, matrix[:3, :3], where)
-                surfaces.append(SurfaceMesh(tets.vertices + matrix[:3, 3], tets.faces, tets.colors))
+                surfaces.append(tet_surface(parts, matrix[:3, :3], where, matrix[:3, 3]))
     if not surfaces:
         raise AssetError(f"{name}: holds no visible mesh", hint="Export splats, or a closed Mesh that is visible")
-    return colored_mesh(surfaces, name)
+    mesh = colored_mesh(surfaces, name)
+    told = (*warned(answer.described["warnings"], name), *answer.described["notes"], *mesh.notes)
+    return replace(mesh, notes=told)
 
 
 def colored_mesh(surfaces: list[SurfaceMesh], name: str) -> ColoredMesh:
     """Return surfaces as one mesh in display colours, which are linear in OpenUSD and gamma-encoded in splats."""
-    linear = np.concatenate([mesh.colors[mesh.faces] for mesh in surfaces])
+    linear = np.concatenate([mesh.colors for mesh in surfaces])
     encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0) ** (1.0 / 2.4) - 0.055)
-    count = len(linear)
+    corners, offset = near_zero(np.concatenate([mesh.vertices[mesh.faces] for mesh in surfaces]).reshape(-1, 3))
+    starts = np.cumsum([0, *(len(mesh.pictures) for mesh in surfaces)])
+    shown = [
+        np.where(mesh.picture < 0, -1, mesh.picture + start) for mesh, start in zip(surfaces, starts, strict=False)
+    ]
     return ColoredMesh(
-        corners=np.concatenate([mesh.vertices[mesh.faces] for mesh in surfaces]).astype(np.float32),
+        corners=corners.reshape(-1, 3, 3).astype(np.float32),
         corner_colors=encoded.astype(np.float32),
-        corner_uvs=np.zeros((count, 3, 2), np.float32),
-        texture_index=np.full(count, -1, np.int32),
-        textures=(),
+        corner_uvs=np.concatenate([mesh.uvs for mesh in surfaces]).astype(np.float32),
+        texture_index=np.concatenate(shown).astype(np.int32),
+        textures=tuple(picture for mesh in surfaces for picture in mesh.pictures),
         name=name,
+        offset=offset,
+        notes=tuple(note for mesh in surfaces for note in mesh.notes),
     )
 
 

@@ -14,7 +14,7 @@ from softmode.deformables.build.quadrature import quadrature_from_points, quadra
 from softmode.deformables.build.quadrature_grid import Quadrature
 from softmode.deformables.build.quadrature_mesh import cap_holes, quadrature_from_mesh
 from softmode.deformables.build.surface_samples import SURFACE_COUNT
-from softmode.deformables.materials.material import Material
+from softmode.deformables.materials.material import Material, warn_of_units
 from softmode.deformables.model.authoring import SCALE_MAX, SCALE_MIN
 from softmode.errors import AssetError, BasisError
 from softmode.objects.loader import Progress
@@ -77,12 +77,14 @@ def place_deformable(
     splats = deformable.splats or _mesh_splats(deformable, splat_count)
     if splats is not None and offset.any():
         splats = splats.transformed(translation=-offset)
+    made_of = deformable.material(body.volume * deformable.scale**3, material)
+    warn_of_units(made_of, deformable.path)
     x, y, z = (deformable.translation + deformable.scale * (deformable.rotation @ offset)).tolist()
     return Placed(
         object=SoftObject(
             body=body,
             splats=splats,
-            material=deformable.material(body.volume * deformable.scale**3, material),
+            material=made_of,
             contact_radius=contact_radius,
             notes=deformable.notes,
         ),

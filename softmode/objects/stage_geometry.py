@@ -30,7 +30,15 @@ class SurfaceMesh:
     faces: Indices
     """Vertex indices, counter-clockwise seen from outside, shape (T, 3)."""
     colors: Array
-    """Display colours 0..1 (linear, as `primvars:displayColor` is) of the vertices, shape (V, 3)."""
+    """Colours 0..1 (linear, as `primvars:displayColor` is) of the corners of each triangle, shape (T, 3, 3)."""
+    uvs: Array
+    """Texture coordinates of the corners, shape (T, 3, 2)."""
+    picture: Indices
+    """Which of `pictures` each triangle shows, -1 for none, shape (T,)."""
+    pictures: tuple[NDArray[np.uint8], ...] = ()
+    """Textures, first row at v = 1, each of shape (height, width, 3)."""
+    notes: tuple[str, ...] = ()
+    """What of its look was not read."""
 
 
 def split_transform(matrix: ArrayLike, where: str) -> tuple[Array, Array]:
@@ -72,7 +80,7 @@ def mesh_surface(parts: dict[str, Any], linear: Array, where: str, offset: Array
     """Return the triangles of a polygon mesh under an affine map; faces that mirror keep facing outwards.
 
     Args:
-        parts: Its `points` (V, 3), `counts`, `indices`, `left_handed`, and `colors`, as authored.
+        parts: Its `points` (V, 3), `counts`, `indices`, `left_handed` and `look`, as authored.
         linear: Matrix of the map, shape (3, 3).
         where: Named by errors.
         offset: Translation of the map [m].
@@ -94,25 +102,27 @@ def mesh_surface(parts: dict[str, Any], linear: Array, where: str, offset: Array
     fans = np.maximum(counts - 2, 0)
     face = np.repeat(np.arange(len(counts)), fans)
     corner = np.arange(len(face)) - np.repeat(np.cumsum(fans) - fans, fans) + 1
-    triangles = indices[np.stack([start[face], start[face] + corner, start[face] + corner + 1], axis=1)]
+    slots = np.stack([start[face], start[face] + corner, start[face] + corner + 1], axis=1)
     if parts["left_handed"] != (np.linalg.det(linear) < 0.0):
-        triangles = triangles[:, ::-1]
+        slots = slots[:, ::-1]
     moved = points @ linear.T + np.asarray(offset, dtype=np.float64)
-    return SurfaceMesh(moved, triangles, _vertex_colors(parts, len(points)))
+    triangles = indices[slots]
+    return SurfaceMesh(moved, triangles, **_look(parts, triangles, face, slots, len(points)))
 
 
-def tet_surface(parts: dict[str, Any], linear: Array, where: str) -> SurfaceMesh:
+def tet_surface(parts: dict[str, Any], linear: Array, where: str, offset: ArrayLike = (0.0, 0.0, 0.0)) -> SurfaceMesh:
     """Return the boundary of a tetrahedral mesh under a linear map: the faces that one tetrahedron alone has.
 
     Args:
-        parts: Its `points` (V, 3), `tets` (T, 4), `left_handed` and `colors`, as authored.
+        parts: Its `points` (V, 3), `tets` (T, 4), `left_handed` and `look`, as authored.
         linear: Matrix of the map, shape (3, 3).
         where: Named by errors.
+        offset: Translation of the map [m].
 
     Raises:
         AssetError: If it has no tetrahedra, indices point nowhere, or positions are not finite.
     """
-    points = finite_points(parts, where) @ linear.T
+    points = finite_points(parts, where) @ linear.T + np.asarray(offset, dtype=np.float64)
     tets = np.asarray(parts.get("tets", np.zeros((0, 4))), dtype=np.int64).reshape(-1, 4)
     if not len(tets) or tets.min() < 0 or tets.max() >= len(points):
         raise AssetError(f"{where}: tetVertexIndices do not fit {len(points)} points", hint="Export the mesh again")
@@ -122,10 +132,11 @@ def tet_surface(parts: dict[str, Any], linear: Array, where: str) -> SurfaceMesh
     tets = np.where((volume < 0.0)[:, None], tets[:, [0, 2, 1, 3]], tets)
     faces = tets[:, _FACES].reshape(-1, 3)
     _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
-    boundary = faces[np.sort(first[count == 1])]
+    outer = np.sort(first[count == 1])
+    boundary = faces[outer]
     kept, renumbered = np.unique(boundary, return_inverse=True)
-    colors = _vertex_colors(parts, len(points))
-    return SurfaceMesh(points[kept], renumbered.reshape(-1, 3).astype(np.int64), colors[kept])
+    look = _look(parts, boundary, outer // 4, 3 * outer[:, None] + np.arange(3), len(points))
+    return SurfaceMesh(points[kept], renumbered.reshape(-1, 3).astype(np.int64), **look)
 
 
 def finite_points(parts: dict[str, Any], where: str) -> Array:
@@ -139,9 +150,53 @@ def finite_points(parts: dict[str, Any], where: str) -> Array:
     return points
 
 
-def _vertex_colors(parts: dict[str, Any], count: int) -> Array:
-    """Return display colours per vertex: authored ones per vertex, else their mean, else grey."""
-    colors = np.asarray(parts.get("colors", [_GREY]), dtype=np.float64)
-    if colors.ndim != 2 or colors.shape[1] != 3 or not np.isfinite(colors).all():
-        colors = np.array([_GREY])
-    return np.clip(colors if len(colors) == count else np.tile(colors.mean(axis=0), (count, 1)), 0.0, 1.0)
+def _look(parts: dict[str, Any], corners: Indices, face: Indices, slots: Indices, count: int) -> dict[str, Any]:
+    """Return the fields of a `SurfaceMesh` that say how it looks.
+
+    Args:
+        parts: What `look` says, as authored: `colors`, `materials` (the first for all, others for faces), `notes`.
+        corners: Vertex of each corner, shape (T, 3).
+        face: Authored face of each triangle, shape (T,).
+        slots: Where faceVarying values have those of each corner, shape (T, 3).
+        count: Number of vertices.
+    """
+    look = parts.get("look", {})
+    notes = list(look.get("notes", ()))
+
+    def spread(given: dict[str, Any] | None, width: int) -> Array | None:
+        """Return the values of a primvar at each corner, shape (T, 3, width)."""
+        if given is None:
+            return None
+        values = np.asarray(given["values"], dtype=np.float64)
+        kind, size = given["interpolation"], len(values)
+        fits = values.ndim == 2 and values.shape[1] == width and bool(np.isfinite(values).all())
+        if fits and (kind == "constant" or size == 1):
+            return np.broadcast_to(values[0], (*corners.shape, width))
+        if fits and kind == "uniform" and face.max(initial=-1) < size:
+            return np.broadcast_to(values[face][:, None], (*corners.shape, width))
+        if fits and kind in ("vertex", "varying") and size == count:
+            return values[corners]
+        if fits and kind == "faceVarying" and slots.max(initial=-1) < size:
+            return values[slots]
+        notes.append(f"primvar {given['name']} is not read: {size} values of interpolation {kind}")
+        return None
+
+    shown = spread(look.get("colors"), 3)
+    colors = np.array(np.broadcast_to(_GREY, (*corners.shape, 3)) if shown is None else shown)
+    uvs, picture, pictures = np.zeros((*corners.shape, 2)), np.full(len(corners), -1), []
+    for one in look.get("materials", ()):
+        here = np.ones(len(corners), bool) if one["faces"] is None else np.isin(face, one["faces"])
+        if "texture" in one:
+            at = spread(one["uvs"], 2)
+            if at is None:
+                notes.append("a texture is not shown: its coordinates are missing")
+                continue
+            uvs[here], colors[here], picture[here] = at[here], 1.0, len(pictures)
+            pictures.append(one["texture"])
+        else:
+            color = one["color"] if "color" in one else spread(one["primvar"], 3)
+            if color is not None:
+                colors[here], picture[here] = np.broadcast_to(color, colors.shape)[here], -1
+    colors = np.clip(colors, 0.0, 1.0)
+    told = tuple(dict.fromkeys(f"{parts['path']}: {note}" for note in notes))
+    return {"colors": colors, "uvs": uvs, "picture": picture, "pictures": tuple(pictures), "notes": told}

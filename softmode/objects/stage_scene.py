@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from softmode.deformables.materials.material import Material
 from softmode.deformables.materials.material_kernels import MaterialModel
 from softmode.errors import AssetError, MaterialError
+from softmode.files import REEXPORT, damage_errors
 from softmode.foreign import process, tokens
 from softmode.objects.stage_geometry import SurfaceMesh, finite_points, mesh_surface, split_transform, tet_surface
 from softmode.splats.formats.usd import UP_AXES, placed, splats_from_prim
@@ -159,43 +161,35 @@ def open_scene(
     skip: Sequence[str] = (),
 ) -> UsdScene:
     """Do what `read_usd_scene` says for some deformables; write the rest to `rest.usdc` in the folder if `copy`."""
-    request = scene_request(path, asset_root, folder, copy=copy)
-    request |= {"only": None if only is None else list(only), "skip": list(skip)}
     name = f"OpenUSD file {path}"
-    return scene_from_answer(process.ask(request, name=name), name)
-
-
-def scene_request(
-    path: str | os.PathLike[str], asset_root: str | os.PathLike[str] | None, folder: str, *, copy: bool
-) -> dict[str, Any]:
-    """Return the request for a scene, see `process.make_request`."""
-    request = process.make_request(
-        "scene", path, os.path.join(folder, "answer"), asset_root=asset_root, limits=process.Limits()
-    )
+    chosen = {"only": None if only is None else list(only), "skip": list(skip)}
     rest = os.path.join(folder, "rest.usdc") if copy else None
-    return request | {"most": MAX_SPLATS, "copy": rest, "strict": True, "only": None, "skip": []}
-
-
-def scene_from_answer(answer: process.Answer, name: str) -> UsdScene:
-    """Return the scene that the process described, in metres with Z up.
-
-    Raises:
-        AssetError: If values contradict each other.
-    """
+    answer = process.read(
+        "scene", path, name=name, asset_root=asset_root, most=MAX_SPLATS, copy=rest, strict=True, **chosen
+    )
     stage = answer.described
     frame = stage_frame(stage, name)
-    with process.invalid_data(name):
+    notes = [*warned(stage["warnings"], name), *stage["notes"]]
+    with damage_errors(name):
         bodies = tuple(_deformable(body, answer.arrays, frame, name) for body in stage["bodies"])
         scenery = [_splats(prim, answer.arrays, frame, np.eye(4), name) for prim in stage["scenery"]]
+    notes += [f"{part.name.removeprefix(f'{name}: ')}: {note}" for part in scenery for note in part.notes]
     return UsdScene(
-        file=name.removeprefix("OpenUSD file "),
+        file=str(path),
         deformables=bodies,
         meters_per_unit=frame.meters,
         kilograms_per_unit=frame.kilograms,
         up_axis=stage["up"],
         scenery=joined(scenery, name) if scenery else None,
-        notes=tuple(stage["notes"]),
+        notes=tuple(notes),
     )
+
+
+def warned(texts: list[str], name: str) -> list[str]:
+    """Return what a stage is to be warned of, having warned of it."""
+    for text in texts:
+        warnings.warn(f"{name}: {text}", stacklevel=4)
+    return texts
 
 
 @dataclass(frozen=True)
@@ -273,12 +267,15 @@ def _deformable(body: dict[str, Any], arrays: list[NDArray[Any]], frame: StageFr
         size = abs(float(np.linalg.det(stretch))) ** (1.0 / 3.0)
         radii = np.broadcast_to(0.5 * size * widths.reshape(-1), (len(points),)).copy()
     pictures = [_splats(prim, arrays, frame, to_asset, name) for prim in body["splats"]]
+    notes += [f"{part.name.removeprefix(f'{name}: ')}: {note}" for part in pictures for note in part.notes]
     meshes = []
     for mesh in body["meshes"]:
         relative = _snapped(to_asset @ frame.matrix(mesh["matrix"]))
         meshes.append(
             mesh_surface(parts_of(mesh, arrays, frame), relative[:3, :3], f"{name}: {mesh['path']}", relative[:3, 3])
         )
+    for mesh in (*meshes, *((surface,) if surface is not None and not meshes and not pictures else ())):
+        notes += mesh.notes
     properties, sources = _properties(body, own)
     mass = body["mass"]
     if mass is None and "masses" in shape:
@@ -310,7 +307,7 @@ def _splats(prim: dict[str, Any], arrays: list[NDArray[Any]], frame: StageFrame,
     if frame.meters != 1.0 or not np.array_equal(frame.up, np.eye(3)):
         part = part.transformed(rotation=frame.up, scale=frame.meters)
     relative = _snapped(into @ frame.matrix(prim["matrix"]))
-    return part if np.array_equal(relative, np.eye(4)) else placed(part, relative)
+    return part if np.array_equal(relative, np.eye(4)) and not any(part.offset) else placed(part, relative)
 
 
 def _snapped(matrix: Array) -> Array:
@@ -324,11 +321,24 @@ def parts_of(shape: dict[str, Any], arrays: list[NDArray[Any]], frame: StageFram
     found: dict[str, Any] = {key: arrays[value] for key, value in shape.items() if type(value) is int}
     points = found.get("points", np.zeros((0, 3)))
     if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind != "f":
-        raise AssetError(f"{shape['path']}: points of shape {points.shape}", hint=process.REEXPORT)
+        raise AssetError(f"{shape['path']}: points of shape {points.shape}", hint=REEXPORT)
     found["points"] = frame.points(points)
     if "widths" in found:
         found["widths"] = frame.meters * found["widths"].astype(np.float64)
-    return {**found, "left_handed": shape["left_handed"]}
+    if "look" in shape:
+        found["look"] = _resolved(shape["look"], arrays)
+    return {**found, "path": shape["path"], "left_handed": shape["left_handed"]}
+
+
+def _resolved(look: dict[str, Any], arrays: list[NDArray[Any]]) -> dict[str, Any]:
+    """Return how a geometry looks, its arrays in place of their numbers."""
+
+    def of(given: Any) -> Any:
+        if isinstance(given, dict):
+            return {key: arrays[value] if type(value) is int else of(value) for key, value in given.items()}
+        return [of(one) if isinstance(one, dict) else one for one in given] if isinstance(given, list) else given
+
+    return of(look)
 
 
 def _properties(body: dict[str, Any], frame: StageFrame) -> tuple[dict[str, float], dict[str, str]]:

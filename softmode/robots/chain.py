@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import importlib
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -41,6 +42,12 @@ class SerialChain:
     """Upper limits, shape (n,)."""
     home: Array
     """Coordinates of the home pose, shape (n,)."""
+    leader: NDArray[np.int64]
+    """Which joint of the chain each one follows, itself for most, shape (n,)."""
+    ratio: Array
+    """Travel of each for a unit of its leader's, shape (n,)."""
+    offset: Array
+    """Coordinate of each where its leader's is zero [rad or m], shape (n,)."""
     tool_position: Array
     """Tool at zero coordinates [m], shape (3,)."""
     tool_rotation: Array
@@ -51,10 +58,30 @@ class SerialChain:
         """Finite limits: a joint without one turns by half a turn to either side."""
         return np.maximum(self.lower, -np.pi), np.minimum(self.upper, np.pi)
 
+    @property
+    def follows(self) -> NDArray[np.bool_]:
+        """Which joints follow another, shape (n,)."""
+        return self.leader != np.arange(len(self.leader))
+
+    def followed(self, q: Array) -> Array:
+        """Return coordinates (B, n) with those of followers where their ties have them."""
+        return np.where(self.follows, self.offset + self.ratio * q[:, self.leader], q)
+
+    def _folded(self, jacobian: Array) -> Array:
+        """Return a Jacobian whose columns of leaders have those of their followers, which become zero."""
+        for k in np.flatnonzero(self.follows):
+            jacobian[:, :, self.leader[k]] += self.ratio[k] * jacobian[:, :, k]
+            jacobian[:, :, k] = 0.0
+        return jacobian
+
     def forward(self, q: Array) -> tuple[Array, Array]:
         """Return positions (B, 3) [m] and rotations (B, 3, 3) of the tool at coordinates of shape (B, n)."""
         position, rotation, _, _ = self._sweep(q)
         return position, rotation
+
+    def lowest(self, q: Array) -> Array:
+        """Return the height of the lowest joint but the first over the base [m], shape (B,)."""
+        return self._sweep(q)[3][:, 1:, 2].min(axis=1, initial=math.inf)
 
     def jacobian(self, q: Array) -> Array:
         """Return d(position, rotation)/dq in the base frame, shape (B, 6, n)."""
@@ -94,7 +121,7 @@ class SerialChain:
         Args:
             position: Wanted positions [m], shape (B, 3).
             rotation: Wanted rotation matrices, shape (B, 3, 3).
-            start: Where the iteration begins, shape (n,).
+            start: Where the iteration begins, shape (n,) or (B, n).
             iterations: How many steps at most.
             length: By how much a rotation error counts [m/rad].
 
@@ -102,19 +129,19 @@ class SerialChain:
             The coordinates, shape (B, n), and the error that is left [m], shape (B,).
         """
         low, high = self.span
-        q = np.tile(np.clip(start, low, high), (len(position), 1))
+        q = self.followed(np.array(np.broadcast_to(np.clip(start, low, high), (len(position), len(low)))))
         weight = np.array([1.0] * 3 + [length] * 3)[:, None]
         moving = np.arange(len(q))
         for _ in range(iterations):
             at, turned, axes, anchors = self._sweep(q[moving])
             error = _pose_error(at, turned, position[moving], rotation[moving], length)
-            jacobian = weight * self._slopes(at, axes, anchors)
+            jacobian = self._folded(weight * self._slopes(at, axes, anchors))
             size = np.linalg.norm(error, axis=1)
             damping = (0.05 * np.minimum(1.0, size / 0.05) + 1.0e-4) ** 2
             normal = jacobian @ jacobian.transpose(0, 2, 1) + damping[:, None, None] * np.eye(6)
             step = np.einsum("bij,bi->bj", jacobian, np.linalg.solve(normal, error[..., None])[..., 0])
             before = q[moving]
-            q[moving] = np.clip(before + np.clip(step, -0.4, 0.4), low, high)
+            q[moving] = self.followed(np.clip(before + np.clip(step, -0.4, 0.4), low, high))
             moving = moving[np.abs(q[moving] - before).max(axis=1) > STILL]
             if not len(moving):
                 break
@@ -127,7 +154,7 @@ class SerialChain:
         first = self.anchor[0]
 
         def distance(q: Array) -> Array:
-            return np.linalg.norm(self.forward(q)[0] - first, axis=1)
+            return np.linalg.norm(self.forward(self.followed(q))[0] - first, axis=1)
 
         random = np.random.default_rng(0)
         q = low + (high - low) * random.random((4000, len(low)))
@@ -164,7 +191,7 @@ def serial_chain(robot: RobotDescription, frame: ToolPose = (0.0, 0.0, 0.0, 0.0,
         ConfigError: If no joint moves the tool.
     """
     mujoco: Any = importlib.import_module("mujoco")
-    model = mujoco.MjModel.from_xml_string(robot.mjcf)
+    model = robot.model
     data = mujoco.MjData(model)
     data.qpos[:] = model.qpos0
     mujoco.mj_kinematics(model, data)
@@ -178,12 +205,25 @@ def serial_chain(robot: RobotDescription, frame: ToolPose = (0.0, 0.0, 0.0, 0.0,
     if not joints:
         raise ConfigError(
             f"no joint moves the end effector {robot.end_effector!r} of robot {robot.name!r}",
-            hint="name a link or site at the end of an arm: end_effector=",
+            hint="name a link or site at the end of an arm, or put the hand upon one: load(arm, hand=...)",
         )
     mount = data.xmat[end].reshape(3, 3)
     inside = Rotation.from_quat(robot.tool[3:])
     place = np.array(robot.tool[:3]) + inside.apply(frame[:3])
     turn = (inside * Rotation.from_quat(frame[3:])).as_matrix()
+    leader, ratio, offset = np.arange(len(joints)), np.ones(len(joints)), np.zeros(len(joints))
+    group = {j: (j, 1.0, 0.0) for j in joints}
+    group |= {
+        names.index(tie.joint): (names.index(tie.leader), tie.ratio, tie.offset)
+        for names in [list(robot.joint_names)]
+        for tie in robot.ties
+    }
+    for k, j in enumerate(joints):
+        # The first joint of the chain that has the same leader, which may stand elsewhere, leads here.
+        first = next(i for i in range(k + 1) if group[joints[i]][0] == group[j][0])
+        _, a, b = group[joints[first]]
+        leader[k], ratio[k] = first, group[j][1] / a
+        offset[k] = group[j][2] - ratio[k] * b
     return SerialChain(
         joints=tuple(joints),
         axis=data.xaxis[joints].copy(),
@@ -192,6 +232,9 @@ def serial_chain(robot: RobotDescription, frame: ToolPose = (0.0, 0.0, 0.0, 0.0,
         lower=np.array(robot.joint_lower)[joints],
         upper=np.array(robot.joint_upper)[joints],
         home=np.array(robot.home)[joints],
+        leader=leader,
+        ratio=ratio,
+        offset=offset,
         tool_position=data.xpos[end] + mount @ place,
         tool_rotation=mount @ turn,
     )

@@ -11,6 +11,7 @@ not that of actuators:
 
 from __future__ import annotations
 
+import copy
 import functools
 import importlib
 import math
@@ -67,8 +68,12 @@ class CompiledRobot:
         self.dropped: set[str] = set()
         self.notes: list[str] = []
         """What was chosen where the file does not say."""
-        self.ties = self._ties()
-        """Per joint its leader, and ratio and offset of q_joint = offset + ratio q_leader."""
+        said = [tie for e in range(model.neq) if (tie := self._tie(e)) is not None]
+        self.bound = self._joined(list(dict.fromkeys(said)))
+        """Per joint its leader by the file's ties, and ratio and offset of q_joint = offset + ratio q_leader."""
+        self.ties = self._joined(self._pulled(), self.bound)
+        """The same with the joints of a tendon that one servo pulls, which nothing else ties."""
+        self._bind_ranges()
         self.passive: list[int] = []
         """Joints without a drive, known after `drives`."""
 
@@ -100,12 +105,22 @@ class CompiledRobot:
         """Return the home pose within the joint limits."""
         if given is None:
             values = np.array([self.at_home.get(name, 0.0) for name in self.joint_names]) - self.reference
-            return np.clip(values, self.lower, self.upper)
+            return np.clip(self._followed(np.clip(values, self.lower, self.upper)), self.lower, self.upper)
         values = np.asarray(given, float)
         if values.shape != (len(self.joint_names),) or not np.all(np.isfinite(values)):
             hint = f"give one number for each of {', '.join(self.joint_names)}"
             raise ConfigError(f"home has shape {values.shape} or holds a value that is not finite", hint=hint)
-        return values
+        followed = self._followed(values)
+        for j in np.flatnonzero(np.abs(followed - values) > 1.0e-6):
+            leader = self.joint_names[self.bound[0][j]]
+            self.notes.append(f"home: {self.joint_names[j]!r} follows {leader!r}, so it is {followed[j]:.4g}")
+        return followed
+
+    def _followed(self, joint_q: np.ndarray) -> np.ndarray:
+        """Return coordinates whose followers are where the file's ties have them."""
+        owner, ratio, shift = self.bound
+        moved = np.array(shift) + np.array(ratio) * joint_q[owner]
+        return np.where(np.array(owner) == np.arange(len(owner)), joint_q, moved)
 
     def data(self, joint_q: np.ndarray) -> Any:
         """Return the kinematics at a pose."""
@@ -153,9 +168,15 @@ class CompiledRobot:
         driven = [j for j in range(count) if self.joint_names[j] not in self.undriven]
         torque_limit: dict[int, float] = {} if model.nu else dict.fromkeys(driven, math.inf)
         for a in range(model.nu):
-            arms = self._transmission(a)
+            arms, name = self._transmission(a), f"actuator {model.actuator(a).name or a!r}"
             if not arms or len({owner[j] for j in arms}) != 1:
+                kind = self.mujoco.mjtTrn(int(model.actuator_trntype[a])).name.removeprefix("mjTRN_").lower()
+                what = "adhesion, which" if kind == "body" else f"a {kind} actuator that" if not arms else "one that"
+                self.notes.append(f"{name} is left out: {what} drives no joint and no group of tied joints")
                 continue
+            dynamics = self.mujoco.mjtDyn(int(model.actuator_dyntype[a])).name.removeprefix("mjDYN_").lower()
+            if dynamics != "none":
+                self.notes.append(f"{name}: its activation ({dynamics}) is left out, it acts at once")
             leader = owner[next(iter(arms))]
             limit = float(np.min(np.abs(model.actuator_forcerange[a]))) if model.actuator_forcelimited[a] else math.inf
             # The force on the leader's coordinate, each joint's part bounded by its own limit.
@@ -170,6 +191,7 @@ class CompiledRobot:
                 continue
             lever = sum(c * ratio[j] for j, c in arms.items())
             if lever == 0.0:
+                self.notes.append(f"{name} is left out: the joints that it pulls cancel")
                 continue
             zero = sum(c * (shift[j] + self.reference[j]) for j, c in arms.items())
             ends = [-math.inf, math.inf]
@@ -193,10 +215,19 @@ class CompiledRobot:
             if drive is None and owner[j] in torque_limit:
                 drives[j] = self._default_drive(j, min(torque_limit[owner[j]], self._joint_limit(j)))
         self.passive = [j for j in range(count) if drives[j] is None]
+        for name, drive in zip(self.joint_names, drives, strict=True):
+            if drive is not None and drive.effort_limit == 0.0:
+                self.notes.append(f"the drive of joint {name!r} has force limit 0: it does not move it")
         # A tie between driven joints is what their drives replace; one between passive joints stays.
+        loops = (int(self.mujoco.mjtEq.mjEQ_CONNECT), int(self.mujoco.mjtEq.mjEQ_WELD))
         for e in range(model.neq):
-            if self._tie(e) is not None and drives[int(model.eq_obj1id[e])] is not None:
-                self.dropped.add(model.equality(e).name)
+            name, tie = model.equality(e).name, self._tie(e)
+            if tie is None and int(model.eq_type[e]) not in loops:
+                self.notes.append(
+                    f"equality {name!r} is left out: it ties no two joints in proportion, or is not active"
+                )
+            if (drives[tie[0]] is not None) if tie else int(model.eq_type[e]) not in loops:
+                self.dropped.add(name)
         return tuple(drives)
 
     def _tie(self, e: int) -> tuple[int, int, float, float] | None:
@@ -208,22 +239,53 @@ class CompiledRobot:
         offset, ratio = model.eq_data[e, :2]
         return int(model.eq_obj1id[e]), int(model.eq_obj2id[e]), float(offset), float(ratio)
 
-    def _ties(self) -> tuple[list[int], list[float], list[float]]:
-        """Return per joint its leader, and ratio and offset of q_joint = offset + ratio q_leader."""
-        count = self.model.njnt
-        owner, ratio, shift = list(range(count)), [1.0] * count, [0.0] * count
+    def _pulled(self) -> list[tuple[int, int, float, float]]:
+        """Return ties for servos on tendons: each moves its joints alike, each by the sign of its coefficient."""
         ties: list[tuple[int, int, float, float]] = []
-        for e in range(self.model.neq):
-            tie = self._tie(e)
-            if tie is not None:
-                ties.append(tie)
-        # A servo on a tendon over joints that nothing ties moves them alike, each by the sign of its coefficient.
         for a in range(self.model.nu):
             first, *others = [(j, c) for j, c in self._transmission(a).items() if c] or [(0, 1.0)]
             ties += [(j, first[0], 0.0, math.copysign(1.0, c * first[1])) for j, c in others]
+        return ties
+
+    def _bind_ranges(self) -> None:
+        """Give tied joints the range that all of them can reach together."""
+        owner, ratio, shift = (np.array(part) for part in self.bound)
+        for leader in np.flatnonzero(np.bincount(owner) > 1):
+            group = owner == leader
+            ends = np.sort((np.array([self.lower, self.upper]) - shift)[:, group] / ratio[group], axis=0)
+            low, high = ends[0].max(), ends[1].min()
+            if low >= high:
+                names = ", ".join(repr(self.joint_names[j]) for j in np.flatnonzero(group))
+                raise AssetError(
+                    f"robot file {self.asset.path}: {names} are tied, and their ranges have no pose in common",
+                    hint="widen their limits, or mend ratio and offset of the tie",
+                )
+            reached = np.sort(shift[group] + np.outer([low, high], ratio[group]), axis=0)
+            self.lower[group], self.upper[group] = reached
+
+    def _joined(
+        self,
+        ties: list[tuple[int, int, float, float]],
+        before: tuple[list[int], list[float], list[float]] | None = None,
+    ) -> tuple[list[int], list[float], list[float]]:
+        """Return per joint its leader, and ratio and offset of q_joint = offset + ratio q_leader.
+
+        Args:
+            ties: Joint, leader, offset and ratio.
+            before: Ties that hold already; others that they imply or contradict are left out. Without them, ties in a
+                circle are refused.
+        """
+        count = self.model.njnt
+        owner, ratio, shift = copy.deepcopy(before) if before else (list(range(count)), [1.0] * count, [0.0] * count)
         for joint, leader, offset, slope in ties:
-            if owner[joint] == owner[leader]:
+            if owner[joint] == owner[leader] and before is not None:
                 continue
+            if owner[joint] == owner[leader]:
+                names = f"{self.joint_names[joint]!r} and {self.joint_names[leader]!r}"
+                raise AssetError(
+                    f"robot file {self.asset.path}: {names} follow each other in a circle",
+                    hint="take one of their ties (<mimic>, <equality>) out of the file",
+                )
             # q_joint = offset + slope q_leader, in terms of the leader's own leader; then all that followed the joint.
             top, slope, offset = owner[leader], slope * ratio[leader], offset + slope * shift[leader]
             old, old_ratio, old_shift = owner[joint], ratio[joint], shift[joint]
@@ -253,17 +315,27 @@ class CompiledRobot:
 
     @functools.cached_property
     def _inertias(self) -> np.ndarray:
-        """What each joint accelerates in the home pose, the others held [kg or kg m^2], shape (joint_count,)."""
-        mass = np.zeros((self.model.nv, self.model.nv))
-        self.mujoco.mj_fullM(self.model, self.data(self.home(None)), mass)
-        return np.diag(mass)
+        """What each joint accelerates, the others held [kg or kg m^2], shape (joint_count,).
+
+        In the home pose; where that is zero, also in a bent one: the larger number of both.
+        """
+        poses = [self.home(None)]
+        if not any(self.at_home.values()):  # a straight arm: what its axes carry stands off them once it bends
+            low, high = np.maximum(self.lower, -math.pi), np.minimum(self.upper, math.pi)
+            hinge = self.model.jnt_type == int(self.mujoco.mjtJoint.mjJNT_HINGE)
+            poses.append(np.where(hinge, np.clip(0.25 * math.pi, 0.75 * low + 0.25 * high, high), 0.0))
+        masses = np.zeros((len(poses), self.model.nv, self.model.nv))
+        for mass, pose in zip(masses, poses, strict=True):
+            self.mujoco.mj_fullM(self.model, self.data(self._followed(pose)), mass)
+        return masses.diagonal(axis1=1, axis2=2).max(axis=0)
 
     def _default_drive(self, j: int, limit: float) -> JointDrive:
         """Return a critically damped drive for a joint without servo."""
-        mass, omega = self._inertias[j], 2.0 * math.pi * self.bandwidth
+        mass, omega, loss = self._inertias[j], 2.0 * math.pi * self.bandwidth, self.model.dof_damping[j]
         return JointDrive(
-            stiffness=float(mass * omega**2),
-            damping=float(max(2.0 * mass * omega - self.model.dof_damping[j], 0.0)),
+            # Against much viscous friction the joint would creep to its target.
+            stiffness=float(max(mass * omega**2, 0.5 * loss * omega)),
+            damping=float(max(2.0 * mass * omega - loss, 0.0)),
             effort_limit=limit,
             lower=float(self.lower[j]),
             upper=float(self.upper[j]),

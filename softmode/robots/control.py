@@ -9,8 +9,9 @@ the command itself must be iterated to convergence, clamped to limits and worksp
 serial chain that is one small kernel.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, ClassVar, Literal
 
 import newton
 import numpy as np
@@ -21,7 +22,9 @@ from softmode.deformables.model.declare import launch
 from softmode.deformables.model.structs import filled
 from softmode.errors import ConfigError
 from softmode.robots import control_kernels as kernels
-from softmode.robots.arm import ARM_JOINT_COUNT, ArmIndices
+from softmode.robots.arm import ARM_JOINT_COUNT, ArmIndices, GripperDescription
+from softmode.robots.control_kernels import Command, Settings
+from softmode.robots.description import RobotIndices
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,8 +79,8 @@ class ArmControlOptions:
         return 5 if self.mode == "pose_delta" else ARM_JOINT_COUNT + 1
 
 
-class ArmController:
-    """Holds the commanded configuration of one arm in every world and writes the joint targets.
+class Controller:
+    """Holds the commanded configuration of one robot in every world and writes the joint targets.
 
     All methods but the constructor only launch kernels on preallocated arrays, so they can be captured in a graph. A
     control step reads::
@@ -89,69 +92,72 @@ class ArmController:
         controller.measure(state)                       # tool_pose, opening for the observation
 
     Args:
-        model: The finalised model; its worlds are copies of the builder that the arm was added to.
-        arm: What `add_arm` returned.
+        model: The finalised model; its worlds are copies of the builder that the robot was added to.
+        arm: Where it stands there.
+        gripper: Its gripper.
+        joints: Coordinates of the joints between base and tool in the robot.
         options: The action's meaning.
 
     Attributes:
-        commanded_q: Commanded joint coordinates, (world_count, 9) [rad, m].
+        commanded_q: Commanded coordinates: joints between base and tool, then twice half the distance between the
+            fingers, (world_count, joint_count + 2) [rad, m].
         tool_pose: Measured pose of the tool frame, (world_count,) transforms, of the last `measure` or `command`.
-        coord_start: First joint coordinate of the arm in each world, (world_count,) int32.
+        coord_start: First joint coordinate of the robot in each world, (world_count,) int32.
         opening: Measured distance between the pads [m], (world_count,).
         target_position: Commanded tool position [m], (world_count,) vec3.
         target_yaw: Commanded tool yaw [rad], (world_count,); zero in the home pose.
     """
 
-    def __init__(self, model: newton.Model, arm: ArmIndices, options: ArmControlOptions | None = None) -> None:
+    kernels: ClassVar[Any]
+    """The kernels of its chain."""
+
+    def __init__(
+        self,
+        model: newton.Model,
+        arm: ArmIndices | RobotIndices,
+        gripper: GripperDescription,
+        joints: Sequence[int],
+        options: ArmControlOptions | None,
+    ) -> None:
         """Allocate the command of every world and set it to the model's initial coordinates."""
-        if not isinstance(arm, ArmIndices):
-            raise ConfigError(
-                f"arm is a {type(arm).__name__}; the controller knows the kinematics of the built-in arm only",
-                hint="a loaded robot has RobotController, or write control.joint_target_q yourself",
-            )
         self.options = options if options is not None else ArmControlOptions()
-        self.arm = arm
-        self.joint_count, self.action_size = ARM_JOINT_COUNT, self.options.action_size
-        self.world_count = max(model.world_count, 1)
-        device = model.device
-        w = self.world_count
-
-        def starts(world_start: wp.array | None, first: int) -> wp.array:
-            assert world_start is not None
-            start = world_start.numpy()
-            # A builder that is finalised without replication keeps everything outside any world.
-            offset = start[:w] if start[w] > start[0] else np.zeros(w, dtype=np.int32)
-            return wp.array(offset + first, dtype=wp.int32, device=device)
-
-        self.coord_start = starts(model.joint_coord_world_start, arm.coord_start)
-        self.joint_columns = wp.array(np.arange(ARM_JOINT_COUNT), dtype=wp.int32, device=device)
-        """Coordinates of the joints between base and tool in the arm, (joint_count,)."""
-        description, gripper = arm.description, arm.description.gripper
-        self._chain = filled(
-            kernels.Chain,
-            model,
-            description,
-            joint_start=starts(model.joint_world_start, arm.joint_start),
-            coord_start=self.coord_start,
-            dof_start=starts(model.joint_dof_world_start, arm.dof_start),
-            home=kernels.vec7(*description.home_joint_q[:ARM_JOINT_COUNT].tolist()),
-        )
+        self.arm, self.joint_count = arm, len(joints)
+        self.action_size = 5 if self.options.mode == "pose_delta" else self.joint_count + 1
+        self.world_count = w = max(model.world_count, 1)
+        self._device = device = model.device
+        self.coord_start = self._starts(model.joint_coord_world_start, arm.coord_start)
+        self.joint_columns = wp.array(np.asarray(joints), dtype=wp.int32, device=device)
+        """Coordinates of the joints between base and tool in the robot, (joint_count,)."""
         # Both drives saturate at an opening error of twice force_limit / stiffness.
         lead = self.options.squeeze_lead * 2.0 * gripper.force_limit / gripper.drive_stiffness
         joint_mode = int(self.options.mode == "joint_delta")
-        self._settings = filled(kernels.Settings, self.options, gripper, joint_mode=joint_mode, opening_lead=lead)
-        self.commanded_q = wp.zeros((w, ARM_JOINT_COUNT + 2), dtype=wp.float32, device=device)
+        self._settings = filled(Settings, self.options, gripper, joint_mode=joint_mode, opening_lead=lead)
+        self.commanded_q = wp.zeros((w, self.joint_count + 2), dtype=wp.float32, device=device)
         self.tool_pose = wp.zeros(w, dtype=wp.transform, device=device)
         self.opening = wp.zeros(w, dtype=wp.float32, device=device)
         self.target_position = wp.zeros(w, dtype=wp.vec3, device=device)
         self.target_yaw = wp.zeros(w, dtype=wp.float32, device=device)
         self.previous_q = wp.zeros_like(self.commanded_q)
         """The command before the last one, from which targets move on."""
-        self._command = filled(kernels.Command, self)
+        self._command = filled(Command, self)
         """What moves when the command does."""
         self._everywhere = wp.ones(w, dtype=wp.bool, device=device)
-        self._device = device
+        self._chain = self._chain_of(model)
+        self._targets: int | tuple[int, int] = w
+        """How many threads write targets."""
         self._reset(model.joint_q, self._everywhere)
+
+    def _chain_of(self, model: newton.Model) -> Any:
+        """Return the robot's chain on the device."""
+        raise NotImplementedError
+
+    def _starts(self, world_start: wp.array | None, first: int) -> wp.array:
+        """Return where something begins in every world, (world_count,) int32."""
+        assert world_start is not None
+        start, w = world_start.numpy(), self.world_count
+        # A builder that is finalised without replication keeps everything outside any world.
+        offset = start[:w] if start[w] > start[0] else np.zeros(w, dtype=np.int32)
+        return wp.array(offset + first, dtype=wp.int32, device=self._device)
 
     def reset(self, state: newton.State, world_mask: wp.array | None = None) -> None:
         """Set the command to the measured configuration.
@@ -163,7 +169,9 @@ class ArmController:
         self._reset(state.joint_q, world_mask if world_mask is not None else self._everywhere)
 
     def _reset(self, joint_q: wp.array | None, world_mask: wp.array) -> None:
-        launch(self._device, kernels.reset_command, self.world_count, self._chain, joint_q, world_mask, self._command)
+        launch(
+            self._device, self.kernels.reset_command, self.world_count, self._chain, joint_q, world_mask, self._command
+        )
 
     def command(self, action: wp.array, state: newton.State) -> None:
         """Move the commanded configuration by one action per world.
@@ -174,11 +182,11 @@ class ArmController:
                 opening_rate: +1 is fully open, -1 squeezes whatever is between the pads with the full drive force.
             state: The measured state, for the anti-windup.
         """
-        if action.shape != (self.world_count, self.options.action_size):
-            hint = f"expected ({self.world_count}, {self.options.action_size}) in mode {self.options.mode!r}"
+        if action.shape != (self.world_count, self.action_size):
+            hint = f"expected ({self.world_count}, {self.action_size}) in mode {self.options.mode!r}"
             raise ConfigError(f"action has shape {tuple(action.shape)}", hint=hint)
         arguments = (self._chain, self._settings, action, state.joint_q, self._command)
-        launch(self._device, kernels.move_command, self.world_count, *arguments)
+        launch(self._device, self.kernels.move_command, self.world_count, *arguments)
 
     def write_targets(self, control: newton.Control, fraction: float = 1.0) -> None:
         """Write the drives' position targets, on the line from the previous command to the present one.
@@ -187,9 +195,45 @@ class ArmController:
             control: Where joint_target_q is written.
             fraction: Share of the control step that the targets should have covered, 0 to 1.
         """
-        dim = (self.world_count, ARM_JOINT_COUNT + 2)
-        launch(self._device, kernels.write_targets, dim, self._chain, self._command, fraction, control.joint_target_q)
+        arguments = (self._chain, self._command, fraction, control.joint_target_q)
+        launch(self._device, self.kernels.write_targets, self._targets, *arguments)
 
     def measure(self, state: newton.State) -> None:
         """Update `tool_pose` and `opening` from the measured joint coordinates."""
-        launch(self._device, kernels.measure, self.world_count, self._chain, state.joint_q, self._command)
+        launch(self._device, self.kernels.measure, self.world_count, self._chain, state.joint_q, self._command)
+
+
+class ArmController(Controller):
+    """The controller of the built-in arm.
+
+    Args:
+        model: The finalised model; its worlds are copies of the builder that the arm was added to.
+        arm: What `add_arm` returned.
+        options: The action's meaning.
+    """
+
+    kernels = kernels
+
+    def __init__(self, model: newton.Model, arm: ArmIndices, options: ArmControlOptions | None = None) -> None:
+        """Allocate the command of every world and set it to the model's initial coordinates."""
+        if not isinstance(arm, ArmIndices):
+            raise ConfigError(
+                f"arm is a {type(arm).__name__}; the controller knows the kinematics of the built-in arm only",
+                hint="a loaded robot has RobotController, or write control.joint_target_q yourself",
+            )
+        self.arm: ArmIndices
+        super().__init__(model, arm, arm.description.gripper, range(ARM_JOINT_COUNT), options)
+        self._targets = (self.world_count, ARM_JOINT_COUNT + 2)
+
+    def _chain_of(self, model: newton.Model) -> Any:
+        """Return the arm in the model's arrays."""
+        description = self.arm.description
+        return filled(
+            kernels.Chain,
+            model,
+            description,
+            joint_start=self._starts(model.joint_world_start, self.arm.joint_start),
+            coord_start=self.coord_start,
+            dof_start=self._starts(model.joint_dof_world_start, self.arm.dof_start),
+            home=kernels.vec7(*description.home_joint_q[:ARM_JOINT_COUNT].tolist()),
+        )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 import math
 from collections.abc import Sequence
@@ -42,6 +43,20 @@ class JointDrive:
             raise ConfigError(
                 f"{self} has a negative effort limit or NaN", hint="give numbers; inf stands for no limit"
             )
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointTie:
+    """A joint that follows another: q = offset + ratio q_leader."""
+
+    joint: str
+    """Name of the joint that follows."""
+    leader: str
+    """Name of the joint that leads, which follows none."""
+    ratio: float
+    """Travel for a unit of the leader's."""
+    offset: float
+    """Coordinate where the leader's is zero [m or rad]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,6 +106,8 @@ class RobotDescription:
     """Names of the end effector's link and of all links behind it."""
     gripper: RobotGripper | None = None
     """The gripper, or None."""
+    ties: tuple[JointTie, ...] = ()
+    """Joints that follow others. Limits are those that all joints of a group reach together."""
     notes: tuple[str, ...] = ()
     """What was chosen where the file does not say it, a line each."""
     gravity_compensation: bool = True
@@ -119,9 +136,22 @@ class RobotDescription:
                 )
 
     @property
+    def model(self) -> Any:
+        """The robot as MuJoCo compiles it, one for all that ask: not to be changed."""
+        return _compiled(self.mjcf)
+
+    @property
     def home_joint_q(self) -> np.ndarray:
         """Joint coordinates of the home pose [m or rad], shape (joint_count,)."""
         return np.array(self.home)
+
+    def followed(self, joint_q: Sequence[float] | np.ndarray) -> np.ndarray:
+        """Return joint coordinates [m or rad] with those of followers where their ties have them."""
+        values = np.array(joint_q, float)
+        for tie in self.ties:
+            leader = values[self.joint_names.index(tie.leader)]
+            values[self.joint_names.index(tie.joint)] = tie.offset + tie.ratio * leader
+        return values
 
     @property
     def passive_joints(self) -> tuple[str, ...]:
@@ -131,8 +161,7 @@ class RobotDescription:
     @mujoco_warnings()
     def joint_inertias(self) -> np.ndarray:
         """Return what each joint accelerates in the home pose, the others held [kg or kg m^2], shape (joint_count,)."""
-        mujoco = importlib.import_module("mujoco")
-        model = mujoco.MjModel.from_xml_string(self.mjcf)
+        mujoco, model = importlib.import_module("mujoco"), self.model
         data = mujoco.MjData(model)
         data.qpos[:] = model.qpos0 + self.home_joint_q
         mujoco.mj_forward(model, data)
@@ -164,7 +193,7 @@ class RobotDescription:
         values = self.home_joint_q if joint_q is None else np.array(joint_q, float)
         for name, closed, wide in zip(self.gripper.joints, self.gripper.closed, self.gripper.open, strict=True):
             values[self.joint_names.index(name)] = closed + opening * (wide - closed)
-        return values
+        return self.followed(values)
 
     def tool_pose(self, joint_q: Sequence[float] | None = None) -> tuple[float, ...]:
         """Return the pose of the tool in the base frame.
@@ -181,8 +210,7 @@ class RobotDescription:
 
     def _link_poses(self, joint_q: Sequence[float] | None = None) -> dict[str, wp.transformd]:
         """Return the pose of every link in the base frame; the home pose's if no coordinates are given."""
-        mujoco = importlib.import_module("mujoco")
-        model = mujoco.MjModel.from_xml_string(self.mjcf)
+        mujoco, model = importlib.import_module("mujoco"), self.model
         data = mujoco.MjData(model)
         data.qpos[:] = model.qpos0 + np.asarray(self.home if joint_q is None else joint_q, float)
         mujoco.mj_kinematics(model, data)
@@ -281,6 +309,11 @@ class RobotDescription:
                 builder.joint_target_ke[dof] = drive.stiffness
                 builder.joint_target_kd[dof] = drive.damping
                 builder.joint_effort_limit[dof] = min(drive.effort_limit, 1.0e6)
+        for name in {name for tie in self.ties for name in (tie.joint, tie.leader)}:
+            k = self.joint_names.index(name)
+            if math.isfinite(self.joint_lower[k]):
+                builder.joint_limit_lower[dof_start + k] = self.joint_lower[k]
+                builder.joint_limit_upper[dof_start + k] = self.joint_upper[k]
 
     def _set_shapes(self, builder: newton.ModelBuilder, shapes: Sequence[int], hand: set[int]) -> None:
         """Replace collision meshes by hulls, and decide what soft bodies touch."""
@@ -320,3 +353,10 @@ class RobotIndices:
     """Body that carries the tool, whose pose in its frame is ``description.tool``."""
     shapes: tuple[int, ...]
     """All shapes of the robot."""
+
+
+@functools.lru_cache(8)
+def _compiled(mjcf: str) -> Any:
+    """Return the compiled model of a robot."""
+    with mujoco_warnings():
+        return importlib.import_module("mujoco").MjModel.from_xml_string(mjcf)

@@ -44,14 +44,14 @@ class Compiled(Protocol):
 
 
 _NAMES = (
-    "pinch pinch_site grasp_site gripperframe link_tcp tcp tool tool0 end_effector ee gripper attachment_site hand "
-    "Fixed_Jaw"
+    "pinch pinch_site grasp_site grasp gripperframe link_tcp tcp tool tool0 ee_site end_effector ee gripper "
+    "attachment_site hand Fixed_Jaw"
 ).split()
 """Names of sites, then of bodies, that are taken for the tool as they are; the first one present."""
 _PATTERNS = (
-    "*tcp *_tool0 *tool_frame *pinch* *grasp_site *grasp_frame *grip_site *gripper_frame* *gripperframe* "
-    "*tool_center* *end_effector* *endeffector* *_eef *_ee *ee_link *eef_link *ee_frame *attachment* *_hand "
-    "*hand_link *palm *palm_link *gripper_base* *gripper_link *gripper *tool_link *tool *flange"
+    "*tcp *tcp_site *_tool0 *tool_frame *pinch* *grasp_site *grasp_frame *grip_site *gripper_frame* *gripperframe* "
+    "grasp* *tool_center* *ee_site *end_effector* *endeffector* *_eef *_ee *ee_link *eef_link *ee_frame *attachment* "
+    "*_hand *hand_link *palm *palm_link *gripper_base* *gripper_link *gripper *tool_link *tool *flange"
 ).split()
 """Patterns of the last part of such a name, in small letters, tried after the names."""
 _POINTS = 400
@@ -111,6 +111,8 @@ def find_gripper(
         joints = _limited(robot, drives, palm)
     if not joints:
         return {}, link, []
+    while len(inner := {_branch(model, palm, j) for j in joints}) == 1 and not model.body_jntnum[min(inner)]:
+        palm = min(inner)  # a mount between them
     ends = closing_ends(robot, drives, start, palm, joints)
     left = [repr(robot.joint_names[j]) for j in joints if j not in ends]
     notes = [f"left out behind the end effector, as they close nothing: {', '.join(left)}"] if left else []
@@ -122,8 +124,8 @@ def closing_ends(
 ) -> dict[int, tuple[float, float]]:
     """Return (closed, open) of those joints that move a finger towards the other finger, or towards the palm.
 
-    A joint closes if the mean distance of the nearest points of both sides differs between its ends. Joints that are
-    tied move together, and loops are closed.
+    Joints close if the mean distance of the nearest points of both sides differs between their ends. Those that are
+    tied move, and close, together; loops are closed.
     """
     model = robot.model
     owner, ratio, shift = robot.ties
@@ -132,28 +134,37 @@ def closing_ends(
     rest = [palm, *(b for b in robot.behind(palm) if b not in moved and _fixed_to(model, b, palm))]
     ends: dict[int, tuple[float, float]] = {}
     way: dict[int, float] = {}
-    for j in joints:
-        drive = drives[j]
-        if drive is None:
-            continue
+
+    def posed(j: int, q: float) -> Any:
+        """Return where everything is with a joint, and all that moves with it, at a coordinate."""
         group = [i for i in range(model.njnt) if owner[i] == owner[j]]
-        own = fingers[_branch(model, palm, j)]
-        others = [b for side in fingers.values() for b in side if b not in own]
+        joint_q = start.copy()
+        joint_q[group] = [shift[i] + ratio[i] * (q - shift[j]) / ratio[j] for i in group]
+        return settled(model, joint_q + robot.reference, robot.passive)
+
+    driven = [(j, drive) for j in joints if (drive := drives[j]) is not None]
+    sides = [set(side) for side in fingers.values()]
+    if len(sides) > 2 and len({owner[j] for j, _ in driven}) == 1:
+        j, drive = driven[0]
+        sides = opposed(posed(j, drive.lower), posed(j, drive.upper), sides)
+    for j, drive in driven:
+        first = next(i for i in joints if owner[i] == owner[j])
+        own = next(sorted(side) for side in sides if _branch(model, palm, j) in side)
+        others = [b for side in sides for b in sorted(side) if b not in own]
         # Two fingers close on each other, one on the palm's own jaw, several on the palm.
-        towards = others if len(fingers) == 2 and others else rest
-        gaps = []
-        for q in (drive.lower, drive.upper):
-            leader = (q - shift[j]) / ratio[j]
-            joint_q = start.copy()
-            joint_q[group] = [shift[i] + ratio[i] * leader for i in group]
-            gaps.append(_mean_gap(robot, joint_q, (own, towards)))
-        if abs(gaps[0] - gaps[1]) >= _LEAST_WAY:
-            low, high = float(drive.lower), float(drive.upper)
-            ends[j] = (low, high) if gaps[0] < gaps[1] else (high, low)
-            way[j] = abs(gaps[0] - gaps[1])
+        towards = others if len(sides) == 2 and others else rest
+        gaps = [_mean_gap(model, posed(j, q), (own, towards)) for q in (drive.lower, drive.upper)]
+        way[first] = way.get(first, 0.0) + (gaps[1] - gaps[0]) * np.sign(ratio[j])
+        ends[j] = (float(drive.lower), float(drive.upper))
     # The fingers of a hand also spread: that changes the distance a little.
-    least = _SPREAD * max(way.values(), default=0.0) if len(fingers) > 2 else 0.0
-    return {j: pair for j, pair in ends.items() if way[j] >= least}
+    most = max(map(abs, way.values()), default=0.0)
+    least = max(_LEAST_WAY, _SPREAD * most if len(sides) > 2 else 0.0)
+    found = {}
+    for j, (low, high) in ends.items():
+        opens = way[next(i for i in joints if owner[i] == owner[j])] * np.sign(ratio[j])
+        if abs(opens) >= least:
+            found[j] = (low, high) if opens > 0.0 else (high, low)
+    return found
 
 
 @mujoco_warnings()
@@ -208,9 +219,15 @@ def surface_corners(model: Any, data: Any, links: Sequence[int]) -> Array:
 
 
 def colliding(model: Any, links: Sequence[int]) -> list[int]:
-    """Return the shapes of links that collide; all of them if none does."""
+    """Return the shapes of links that touch: those that collide, or all of links of which none does.
+
+    Links without a joint between them are one: what is only seen of one does not touch if another collides.
+    """
     own = [geom for geom in range(model.ngeom) if int(model.geom_bodyid[geom]) in links]
-    return [geom for geom in own if model.geom_contype[geom] | model.geom_conaffinity[geom]] or own
+    mask = model.geom_contype | model.geom_conaffinity
+    rigid = model.body_weldid[model.geom_bodyid]
+    solid = {int(rigid[geom]) for geom in own if mask[geom]}
+    return [geom for geom in own if mask[geom] or int(rigid[geom]) not in solid]
 
 
 def _last_part(name: str) -> str:
@@ -272,12 +289,26 @@ def _fixed_to(model: Any, link: int, palm: int) -> bool:
     return True
 
 
-def _mean_gap(robot: Compiled, joint_q: Array, sides: Sequence[Sequence[int]]) -> float:
+def opposed(first: Any, last: Any, sides: Sequence[set[int]]) -> list[set[int]]:
+    """Return the fingers of a hand that one motor closes: branches of the palm that move in the same direction.
+
+    Args:
+        first: Where everything is at one end of its travel.
+        last: Where everything is at the other.
+        sides: The links of each branch.
+    """
+    moved = np.array([(last.xipos - first.xipos)[sorted(side)].mean(0) for side in sides])
+    moved = moved - moved.mean(0)  # what they do alike, such as to come out, tells nothing
+    along = moved @ np.linalg.svd(moved)[2][0] > 0.0
+    groups = [set[int]().union(*(side for side, one in zip(sides, along, strict=True) if one == k)) for k in (1, 0)]
+    return [group for group in groups if group]
+
+
+def _mean_gap(model: Any, data: Any, sides: Sequence[Sequence[int]]) -> float:
     """Return the mean distance of the points of both sides from the nearest one of the other [m]."""
-    data = settled(robot.model, joint_q + robot.reference, robot.passive)
     clouds = []
     for side in sides:
-        points = surface_corners(robot.model, data, side)
+        points = surface_corners(model, data, side)
         if not len(points):
             points = data.xipos[list(side)]
         clouds.append(points[:: max(1, len(points) // _POINTS)])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,13 +14,15 @@ from softmode.errors import ConfigError
 from softmode.robots.arm import ArmDescription
 from softmode.robots.arm_shapes import finger_parts, hand_parts
 from softmode.robots.description import RobotDescription, ToolPose
-from softmode.robots.hand import colliding, settled, side_of, surface_corners
+from softmode.robots.hand import colliding, opposed, settled, side_of, surface_corners
 
 Array = NDArray[np.float64]
 
 _FACE = 0.002
 """How far behind the foremost point of a finger its face reaches [m]: pads are rounded, and some are tilted."""
 
+_USUAL = 0.06
+"""Width of what is usually grasped [m]."""
 _TIP = 0.01
 """How far behind the tip of a finger a link may end that counts as its pad [m]."""
 
@@ -96,7 +97,7 @@ def gap_of(robot: RobotDescription, jaw: ParallelJaw, opening: float) -> float:
         jaw: Its fingers.
         opening: 0 is closed, 1 is open.
     """
-    model: Any = importlib.import_module("mujoco").MjModel.from_xml_string(robot.mjcf)
+    model = robot.model
     data = _kinematics(robot, model, opening)
     mount = data.xmat[model.body(robot.end_effector).id].reshape(3, 3)
     turn = mount @ (Rotation.from_quat(robot.tool[3:]) * Rotation.from_quat(jaw.frame[3:])).as_matrix()
@@ -112,14 +113,14 @@ def dry_friction_of(robot: RobotDescription) -> float:
     Args:
         robot: A robot with a gripper.
     """
-    model: Any = importlib.import_module("mujoco").MjModel.from_xml_string(robot.mjcf)
+    model = robot.model
     closed, wide = (_kinematics(robot, model, opening).qpos for opening in (0.0, 1.0))
     return float(np.abs(wide - closed) @ model.dof_frictionloss)
 
 
 def _measured(robot: RobotDescription) -> ParallelJaw:
     """Measure the jaw of a robot from a file."""
-    model: Any = importlib.import_module("mujoco").MjModel.from_xml_string(robot.mjcf)
+    model = robot.model
     sides = _fingers(robot, model)
     hand = [model.body(name).id for name in robot.hand_links]
     hand = [link for link in hand if link not in sides[0] + sides[1]]
@@ -149,7 +150,9 @@ def _measured(robot: RobotDescription) -> ParallelJaw:
     pads = [left[left[:, 1] < face[0] + _FACE], right[right[:, 1] > face[1] - _FACE]]
     low = np.max([pad.min(0) for pad in pads], axis=0)
     high = np.min([pad.max(0) for pad in pads], axis=0)
-    tips = min(left[:, 2].max(), right[:, 2].max())
+    # The fingers of linkages come out as they close: the table is what they must not reach then.
+    poses = (wide, _kinematics(robot, model, min(_USUAL / opening, 1.0)))
+    tips = max(min(float((surface_corners(model, pose, side) @ turn[:, 2]).max()) for side in sides) for pose in poses)
     whole = fingers[0] @ turn
     beside = whole[whole[:, 2] >= min(low[2], high[2]) - 1e-9]
     base = base @ turn
@@ -189,7 +192,7 @@ def _pad_corners(model: Any, data: Any, side: list[int], out: Array) -> Array:
     return np.concatenate(near) if near else np.empty((0, 3))
 
 
-_HINT = "give ParallelJaw(opening=..., ...) yourself"
+_HINT = "give ParallelJaw(opening=..., ...) yourself; tasks need two fingers that both move"
 
 
 def _fingers(robot: RobotDescription, model: Any) -> tuple[list[int], list[int]]:
@@ -197,15 +200,19 @@ def _fingers(robot: RobotDescription, model: Any) -> tuple[list[int], list[int]]
     joints = robot.gripper.joints if robot.gripper else ()
     driven = {model.body(robot.joint_links[robot.joint_names.index(name)]).id for name in joints}
     roots = [link for link in sorted(driven) if not _above(model, link) & driven]
-    if len(roots) != 2:
-        raise ConfigError(f"robot {robot.name!r} has {len(roots)} driven fingers, not two", hint=_HINT)
-    sides = []
+    sides: list[set[int]] = []
     for root in roots:
         palm = int(model.body_parentid[root])
-        own = [b for b in range(1, model.nbody) if root in {b, *_above(model, b)}]
+        own = {b for b in range(1, model.nbody) if root in {b, *_above(model, b)}}
         # A link that a loop ties to the driven one belongs to the finger: the pads of linkages hang there.
-        sides.append(sorted({*own, *side_of(model, palm, root)}))
-    first, second = sides
+        sides.append(own | set(side_of(model, palm, root)))
+    leaders = {tie.joint: tie.leader for tie in robot.ties}
+    if len(sides) > 2 and len({leaders.get(name, name) for name in joints}) == 1:
+        sides = opposed(_kinematics(robot, model, 0.0), _kinematics(robot, model, 1.0), sides)
+    if len(sides) != 2:
+        fixed = " (one that moves against a jaw that does not)" if len(roots) == 1 else ""
+        raise ConfigError(f"robot {robot.name!r} has {len(roots)} driven fingers{fixed}, not two", hint=_HINT)
+    first, second = (sorted(side) for side in sides)
     return first, second
 
 
@@ -215,7 +222,7 @@ def finger_names(robot: RobotDescription) -> tuple[tuple[str, ...], tuple[str, .
     Raises:
         ConfigError: If the robot has no two driven fingers.
     """
-    model: Any = importlib.import_module("mujoco").MjModel.from_xml_string(robot.mjcf)
+    model = robot.model
     first, second = _fingers(robot, model)
     return tuple(model.body(b).name for b in first), tuple(model.body(b).name for b in second)
 

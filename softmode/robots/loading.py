@@ -20,13 +20,14 @@ import numpy as np
 from softmode.checks import require_number
 from softmode.deformables.coupling.rigid_solver import mujoco_warnings
 from softmode.errors import AssetError, ConfigError
+from softmode.files import reader
 from softmode.foreign import process
 from softmode.foreign.child.model import check_parts, open_spec
 from softmode.foreign.tokens import SUFFIXES
 from softmode.robots.assets import RobotAsset, find, names_file
 from softmode.robots.compiled import CompiledRobot
-from softmode.robots.description import RobotDescription
-from softmode.robots.hand import find_end_effector
+from softmode.robots.description import JointTie, RobotDescription
+from softmode.robots.hand import colliding, find_end_effector
 from softmode.robots.joint_split import hold_base, split_links
 from softmode.robots.meshes import use_meshes
 from softmode.robots.references import check_references, default_root, read_xml
@@ -37,7 +38,7 @@ _LEAST_MASS, _LEAST_INERTIA = 1.0e-4, 1.0e-7
 """What links that move get that have no mass of their own, [kg] and [kg m^2]."""
 
 
-@process.typed("robot file")
+@reader("robot file")
 def load(
     source: str | Path,
     *,
@@ -72,8 +73,9 @@ def load(
         hand: A gripper that the robot's file has not: a name, or a file that holds nothing else. Its first link is put
             upon `end_effector`, the flange; its own end effector becomes that of the robot, and its names begin with
             ``hand_``.
-        asset_root: Folder outside which the file may refer to nothing. If omitted: its own folder, or the one above a
-            folder called `urdf` or `robots`, and of a URDF the packages that it names, found above it.
+        asset_root: Folder outside which the file may refer to nothing. If omitted: its own folder, the one above a
+            folder called `urdf`, `mjcf` or the like, or that of its `package.xml`; and of a URDF the packages that it
+            names, found above it.
         drive_bandwidth: Natural frequency of the drives of joints without a servo [Hz].
         floating: Whether a base on a free joint may move, by three slides and three hinges without drives;
             otherwise it is held where the home pose has it.
@@ -101,7 +103,7 @@ def load(
     free = [j for j in range(full.njnt) if full.jnt_type[j] == 0 and full.body_parentid[full.jnt_bodyid[j]] == 0]
     at_home = {full.joint(j).name: float(key[full.jnt_qposadr[j]]) for j in range(full.njnt)}
     root = asset.root if root is None else root
-    _keep_robot(spec, root, asset)
+    notes += _keep_robot(spec, root, asset)
     if hand is not None:
         end_effector, more = _attach(spec, asset, end_effector, _locate(hand, None, download))
         notes += more
@@ -120,6 +122,7 @@ def load(
     link, tool = robot.tool(end_effector, np.array(offset), drives)
     jaws, palm = robot.gripper(gripper, drives, start, link)
     behind = sorted({*robot.behind(palm), *robot.behind(link)})
+    robot.notes += _let_touch(spec, robot, behind)
     for equality in list(spec.equalities):
         if equality.name in robot.dropped:
             spec.delete(equality)
@@ -141,15 +144,33 @@ def load(
         tool=tool,
         hand_links=tuple(robot.link(b) for b in behind),
         gripper=jaws,
+        ties=tuple(
+            JointTie(joint=robot.joint_names[j], leader=robot.joint_names[owner], ratio=ratio, offset=offset)
+            for j, (owner, ratio, offset) in enumerate(zip(*robot.bound, strict=True))
+            if owner != j
+        ),
         notes=tuple(robot.notes),
     )
+
+
+def _let_touch(spec: Any, robot: CompiledRobot, hand: list[int]) -> list[str]:
+    """Let what is only seen of a hand collide where nothing else does; return notes."""
+    model, notes = robot.model, []
+    taken = [geom for geom in colliding(model, hand) if not model.geom_contype[geom] | model.geom_conaffinity[geom]]
+    for link in sorted({int(model.geom_bodyid[geom]) for geom in taken}):
+        for geom in spec.body(robot.link(link)).geoms:
+            geom.contype = geom.conaffinity = 1
+        notes.append(f"link {robot.link(link)!r} of the hand has no collision geometry: what is seen of it touches")
+    solid = set(model.geom_bodyid[colliding(model, hand)].tolist())
+    bare = [repr(robot.link(b)) for b in hand if b not in solid and model.body_geomnum[b]]
+    return notes + ([f"links of the hand that touch nothing: {', '.join(bare)}"] if bare else [])
 
 
 def _attach(spec: Any, asset: RobotAsset, flange: str | None, hand: RobotAsset) -> tuple[str, list[str]]:
     """Put a gripper upon a robot's flange; return the name of the site or link that carries the tool, and notes."""
     tool, notes = _read(hand)
     _compile(tool, hand, notes)
-    _keep_robot(tool, hand.root, hand)
+    notes += _keep_robot(tool, hand.root, hand)
     compiled = CompiledRobot(_compile(tool, hand), hand, {})
     name = hand.end_effector or find_end_effector(compiled, compiled.drives())[0]
     if flange is None:
@@ -173,8 +194,8 @@ def _locate(source: str | Path, asset_root: str | Path | None, download: bool) -
     if isinstance(source, str) and not names_file(source):
         return find(source, download=download)
     path = Path(source)
-    urdf = path.suffix.lower() == ".urdf"
-    folder = Path(asset_root) if asset_root is not None else default_root(path) if urdf else path.parent
+    stage = path.suffix.lower() in SUFFIXES
+    folder = Path(asset_root) if asset_root is not None else path.parent if stage else default_root(path)
     if path.exists() and not path.resolve().is_relative_to(folder.resolve()):
         raise AssetError(f"robot file {path} lies outside asset_root = {folder}", hint="name a folder that holds it")
     return RobotAsset(name=path.stem, path=path, asset_root=folder, root_given=asset_root is not None)
@@ -197,7 +218,7 @@ def _read(asset: RobotAsset) -> tuple[Any, list[str]]:
             f"robot file {asset.path} starts with <{tree.tag}>", hint="MJCF starts with <mujoco>, URDF with <robot>"
         )
     if not asset.trusted:
-        process.read("model", asset.path, name=f"robot file {asset.path}", text=text, size=size)
+        process.read("model", asset.path, name=f"robot file {asset.path}", text=text, size=2 * size)
     try:
         return open_spec(str(asset.path), text), notes
     except (ValueError, RuntimeError) as error:
@@ -223,11 +244,36 @@ def _prepare_urdf(tree: ElementTree.Element, asset: RobotAsset) -> tuple[str, li
         inertia = link.find("inertial/inertia")
         if inertia is not None and _mended(inertia):
             notes.append(f"link {link.get('name')!r} had an inertia that is none, only its diagonal is kept")
+    notes += _checked_joints(tree, asset)
     for texture in tree.iter("texture"):
         texture.attrib.pop("filename", None)
     files = {mesh.get("filename", "") for mesh in tree.iter("mesh")}
     size = sum(Path(file).stat().st_size for file in files if Path(file).is_file())
     return ElementTree.tostring(tree, encoding="unicode"), notes, size
+
+
+def _checked_joints(tree: ElementTree.Element, asset: RobotAsset) -> list[str]:
+    """Refuse limits and ties of a URDF that MuJoCo would pass over without a word; return notes."""
+    notes, names = [], {joint.get("name") for joint in tree.findall("joint")}
+    for joint in tree.findall("joint"):
+        name, limit, mimic = joint.get("name"), joint.find("limit"), joint.find("mimic")
+        if mimic is not None and mimic.get("joint") not in names - {name}:
+            raise AssetError(
+                f"robot file {asset.path}: joint {name!r} mimics {mimic.get('joint')!r}, which is no other joint of it",
+                hint=f"name one of {', '.join(sorted(map(str, names - {name})))}, or remove <mimic>",
+            )
+        if limit is None or joint.get("type") not in ("revolute", "prismatic"):
+            continue
+        try:
+            low, high, effort = (float(limit.get(key, d)) for key, d in (("lower", 0), ("upper", 0), ("effort", -1)))
+        except ValueError:
+            continue  # the compiler says where
+        if low > high:
+            text = f"robot file {asset.path}: joint {name!r} has its lower limit {low:g} above the upper one {high:g}"
+            raise AssetError(text, hint="exchange them")
+        notes += [f"joint {name!r} has the empty range {low:g} to {high:g}: taken as no limit"] if low == high else []
+        notes += [f"joint {name!r} has effort 0: taken as no limit"] if effort == 0.0 else []
+    return notes
 
 
 def _mended(inertia: ElementTree.Element) -> bool:
@@ -273,8 +319,8 @@ def _one_line(error: Exception) -> str:
     return "; ".join(line.strip() for line in str(error).splitlines() if line.strip())
 
 
-def _keep_robot(spec: Any, root: str | None, asset: RobotAsset) -> None:
-    """Delete all but the robot, name what has no name, make asset paths absolute."""
+def _keep_robot(spec: Any, root: str | None, asset: RobotAsset) -> list[str]:
+    """Delete all but the robot, name what has no name, make asset paths absolute; return notes."""
     tops = list(spec.worldbody.bodies)
     chosen = [body for body in tops if body.name == root] if root is not None else tops
     if len(chosen) != 1:
@@ -283,6 +329,13 @@ def _keep_robot(spec: Any, root: str | None, asset: RobotAsset) -> None:
         raise ConfigError(
             f"robot file {asset.path} {what}", hint=f"pass root= one of {names}" if tops else "give it a <body>"
         )
+    left = [body.name or "a body without a name" for body in tops if body is not chosen[0]]
+    left += [f"{len(spec.worldbody.geoms)} shapes of the world"] if spec.worldbody.geoms else []
+    notes = [f"left out beside the robot: {', '.join(left)}"] if left else []
+    for body in spec.bodies:
+        if body.mocap:
+            body.mocap = False
+            notes.append(f"link {body.name!r} is moved from outside (mocap) in the file: here it stands still")
     for group in (spec.keys, spec.cameras, spec.lights, spec.sensors, spec.worldbody.geoms, spec.worldbody.sites):
         for element in list(group):
             spec.delete(element)
@@ -290,6 +343,7 @@ def _keep_robot(spec: Any, root: str | None, asset: RobotAsset) -> None:
         if body is not chosen[0]:
             spec.delete(body)
     if root is not None:
+        notes += [f"{root!r} moved from {np.round(chosen[0].pos, 4).tolist()} m to the origin"]
         chosen[0].pos, chosen[0].quat = (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
     for kind, group in (("link", spec.bodies), ("joint", spec.joints), ("equality", spec.equalities)):
         for k, element in enumerate(group):
@@ -308,3 +362,4 @@ def _keep_robot(spec: Any, root: str | None, asset: RobotAsset) -> None:
                 raise AssetError(f"robot file {asset.path} refers to {file}", hint="keep assets inside the asset root")
             element.file = str(file)
     spec.meshdir = spec.texturedir = ""
+    return notes

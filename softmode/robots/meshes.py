@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 
 from softmode.deformables.build.cache import cache_directory, fingerprint_of, is_trusted, writable_cache
 from softmode.errors import AssetError, MissingExtraError, needs_extra
-from softmode.files import whole_file
+from softmode.files import damage_errors, whole_file
 from softmode.foreign import process
 from softmode.robots.assets import RobotAsset
 from softmode.robots.references import check_count, resolve_inside, resolve_package
@@ -126,7 +126,7 @@ def _read(file: Path, asset: RobotAsset) -> Any:
             import collada  # noqa: F401  # pyright: ignore[reportMissingImports]
     name = f"robot file {asset.path}: mesh {file}"
     try:
-        with process.invalid_data(name):
+        with damage_errors(name):
             points, faces = process.read("mesh", file, name=name, want="surface").arrays
             mesh = trimesh.Trimesh(points, faces, process=False)
     except AssetError as error:

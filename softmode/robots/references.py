@@ -6,6 +6,7 @@ links wherever they lead, so every reference is resolved here first and refused 
 
 from __future__ import annotations
 
+import collections
 import functools
 import os
 import re
@@ -13,12 +14,16 @@ from pathlib import Path, PurePosixPath
 from xml.etree import ElementTree
 
 from softmode.errors import AssetError
+from softmode.files import read_file
 from softmode.foreign.child.layers import inside
+from softmode.foreign.child.model import MAX_PARTS, MAX_SHAPES
 
 _SIZE_LIMIT = 64 * 2**20
 """Largest XML file that is read [bytes]."""
 _MARK_LIMIT = 500_000
 """Most elements and attributes of a robot file and all that it includes: each takes a hundred bytes and more."""
+_MOST = dict.fromkeys(("key", "body", "link"), MAX_PARTS) | dict.fromkeys(("joint", "geom", "site"), MAX_SHAPES)
+"""Most elements of a kind, of which MuJoCo takes seconds for some ten thousands."""
 _DEPTH_LIMIT = 1000
 _REFERENCE_LIMIT = 4096
 """Most references to files."""
@@ -29,8 +34,8 @@ _NESTED_TAGS = ("include", "model")
 """Elements whose file is itself a model."""
 _LEVELS = 8
 """How many folders above a robot file its packages are looked for in."""
-_URDF_FOLDERS = ("urdf", "urdfs", "robots")
-"""Names of folders of a package that hold URDF files alone; meshes lie beside them."""
+_MODEL_FOLDERS = {".urdf": ("urdf", "urdfs", "robots"), ".xml": ("mjcf", "xml", "xmls", "robots")}
+"""Names of folders of a package that hold robot files of a kind alone; meshes lie beside them."""
 
 
 def read_xml(path: Path) -> ElementTree.Element:
@@ -51,17 +56,9 @@ def read_xml(path: Path) -> ElementTree.Element:
 
 def _parse(path: Path, left: int) -> tuple[ElementTree.Element, int]:
     """Return the root element of a file, and how many elements and attributes it may have at most, `left` or fewer."""
-    if not path.is_file():
-        what = "is a folder" if path.is_dir() else "does not exist"
-        raise AssetError(f"robot file {path} {what}", hint="give the path of an MJCF (.xml) or URDF (.urdf) file")
-    if path.stat().st_size > _SIZE_LIMIT:
-        raise AssetError(
-            f"robot file {path} has {path.stat().st_size} bytes", hint=f"at most {_SIZE_LIMIT} bytes are read"
-        )
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise AssetError(f"robot file {path} cannot be read: {error.strerror}", hint="check its permissions") from error
+    data = read_file(
+        path, "robot file", limit=_SIZE_LIMIT, hint="give an MJCF (.xml) or URDF (.urdf) file that can be read"
+    )
     if b"<!DOCTYPE" in data or b"<!ENTITY" in data or b"\0" in data:  # zeros: UTF-16, which may hide the others
         hint = "remove its <!DOCTYPE>; none is needed, and save it as UTF-8"
         raise AssetError(f"robot file {path} declares a document type, or is no UTF-8", hint=hint)
@@ -79,6 +76,11 @@ def _parse(path: Path, left: int) -> tuple[ElementTree.Element, int]:
         level, depth = [child for element in level for child in element], depth + 1
         if depth > _DEPTH_LIMIT:
             raise AssetError(f"robot file {path} is nested deeper than {_DEPTH_LIMIT} levels", hint="flatten it")
+    counts = collections.Counter(element.tag for element in tree.iter())
+    for tag, most in _MOST.items():
+        if counts[tag] > most:
+            text = f"robot file {path} has {counts[tag]} <{tag}>, at most {most} are read"
+            raise AssetError(text, hint="give the robot alone, without the scene around it")
     for element in tree.iter():
         for name, value in element.attrib.items():
             if "nan" in value.lower() and _NAN.search(value) and "name" not in name:  # MuJoCo reads it as nothing
@@ -170,7 +172,7 @@ def resolve_package(whole: str, file: Path, root: Path, given: bool) -> Path:
     """Return the file that a reference `package://NAME/PATH` means.
 
     It is looked for in the asset root, and in the folder of the package: one above the file or beside what lies above
-    it, whose `package.xml` has that name.
+    it, whose `package.xml` has that name, or which has that name and a `package.xml`.
 
     Args:
         whole: What stands behind `package://`.
@@ -197,15 +199,23 @@ def package_folder(name: str, rest: str, file: Path) -> Path | None:
         return None
     for up in list(file.resolve().parents)[:_LEVELS]:
         for folder in (up / name, up):
-            if _package_name(folder) == name and (folder / rest).exists():
+            found = _package_name(folder)
+            if (found == name or (found is not None and folder.name == name)) and (folder / rest).exists():
                 return folder
     return None
 
 
 def default_root(file: Path) -> Path:
-    """Return the folder that a URDF may refer to: its own, or the one above if its own is one for URDF files."""
-    folder = file.parent
-    return folder.parent if folder.name in _URDF_FOLDERS else folder
+    """Return the folder that a robot file may refer to: its own, or the one above if its own is for such files alone.
+
+    An MJCF file, which names no packages, may refer to the folder further above that has a `package.xml`.
+    """
+    folder, urdf = file.parent, file.suffix.lower() == ".urdf"
+    if not urdf:
+        for up in list(folder.parents)[:_LEVELS]:
+            if (up / "package.xml").is_file():
+                return up
+    return folder.parent if folder.name in _MODEL_FOLDERS[".urdf" if urdf else ".xml"] else folder
 
 
 def _package_name(folder: Path) -> str | None:

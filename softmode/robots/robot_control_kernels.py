@@ -39,6 +39,9 @@ class RobotChain:
     lower: wp.array[float]
     upper: wp.array[float]
     home: vec8
+    leader: wp.array[int]  # (count,) the joint of the chain that each one follows, itself for most
+    ratio: wp.array[float]
+    offset: wp.array[float]
     tool: wp.transform  # at zero coordinates
     coord_start: wp.array[int]  # (world_count,)
     joint: wp.array[int]  # (count,) coordinate in the robot
@@ -87,6 +90,16 @@ def _jacobian(chain: RobotChain, q: vec8, rotation_weight: float):
 
 
 @wp.func
+def _followed(chain: RobotChain, q: vec8):
+    """Return coordinates with those of followers where their ties have them."""
+    moved = vec8(q)
+    for k in range(chain.count):
+        if chain.leader[k] != k:
+            moved[k] = chain.offset[k] + chain.ratio[k] * q[chain.leader[k]]
+    return moved
+
+
+@wp.func
 def _inverse(
     chain: RobotChain, settings: Settings, position: wp.vec3, rotation: wp.quat, q_start: vec8, low: vec8, high: vec8
 ):
@@ -102,6 +115,11 @@ def _inverse(
         e_position = position - wp.transform_get_translation(pose)
         e_rotation = settings.rotation_weight * _rotation_between(rotation, wp.transform_get_rotation(pose))
         jacobian = _jacobian(chain, q, settings.rotation_weight)
+        for k in range(chain.count):
+            if chain.leader[k] != k:
+                for i in range(6):
+                    jacobian[i, chain.leader[k]] = jacobian[i, chain.leader[k]] + chain.ratio[k] * jacobian[i, k]
+                    jacobian[i, k] = 0.0
         pull = gain * (chain.home - q)
         right = vec6()
         for i in range(3):
@@ -115,6 +133,7 @@ def _inverse(
         q = q + pull + wp.transpose(jacobian) * _solve_spd(normal, right)
         for k in range(chain.count):
             q[k] = wp.clamp(q[k], low[k], high[k])
+        q = _followed(chain, q)
     return q
 
 
@@ -218,6 +237,7 @@ def move_command(
         for k in range(chain.count):
             moved = q[k] + settings.joint_scale * _clean(action[world, k])
             q[k] = wp.clamp(wp.clamp(moved, measured[k] - lead, measured[k] + lead), low[k], high[k])
+        q = _followed(chain, q)
         pose = _forward(chain, q)
         position = wp.transform_get_translation(pose)
         inside = _clamp_into(position, settings.workspace_lower, settings.workspace_upper)

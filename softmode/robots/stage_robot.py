@@ -146,9 +146,21 @@ class _Translation:
                 open_ends.append(child)
         for j in set(range(scene.joint_count)) - set(tree):
             self._close_loop(j)
+        offsets: dict[str, float] = {}
+        for mimic in said["mimics"]:
+            if not set(mimic["leader"]) & set(scene.joint_label):
+                raise AssetError(
+                    f"robot file {self.asset.path}: {mimic['path']} follows {mimic['leader'] or 'nothing'}, which is "
+                    "no joint of it",
+                    hint="name the joint that leads, or take the mimic schema away",
+                )
+            if mimic["offset"] is not None:  # Newton takes PhysX' degrees for radians
+                offsets[mimic["path"]] = mimic["offset"]
         for j, leader in enumerate(scene.joint_mimic_joint):
             if leader >= 0:
-                self._tie(j, leader, scene.joint_mimic_coeffs[j])
+                offset, ratio = scene.joint_mimic_coeffs[j]
+                self._tie(j, leader, (offsets.get(scene.joint_label[j], offset), ratio))
+        self.notes += [f"{path} is kinematic in the stage: here its joints move it" for path in said["kinematic"]]
         self._actuate(said)
         self._set_home()
         return self.spec

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -10,6 +9,7 @@ from typing import Any
 
 import newton
 import numpy as np
+import warp as wp
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -33,6 +33,18 @@ _YAW = 1.4
 """How far the tool must turn about the vertical to either side over the home position [rad]."""
 _NEAR = 2.0e-3
 """Error of the inverse kinematics that counts as reached [m]."""
+_SHARES = (1.0, 0.75, 0.5, 0.3)
+"""Shares of the ranges that are tried in turn."""
+_HEIGHTS = (0.0, 0.15, 0.3, 0.45)
+"""How high above the table the base is tried, in turn [m]."""
+_FREE = 5.7
+"""Range of an upright first joint from which on the base needs not be turned [rad]."""
+_LOW = 0.13
+"""Lowest tool position of the home pose that a robot of small reach gets [m]: over what stands on the table."""
+_BENT = ((0.0, -1.0, 1.0, -1.0, -1.0, 0.0), (0.0, -1.0, -1.0, 1.0, 1.0, 0.0), (0.0, 0.3, 0.0, -1.0, 0.0, 1.0))
+"""Poses in which the search begins, in quarters of the ranges of the joints: shoulder, elbow and wrist bent."""
+_ROOM = 0.1
+"""How far every joint of the home pose should be from the ends of its range [rad]."""
 _STUCK = 0.5e-3
 """How far dry friction of its joints may hold a finger from where its drive aims [m]."""
 
@@ -145,6 +157,13 @@ class TableRobot:
     ) -> RobotIndices:
         """Add the robot in its home pose to a builder; `xform` places its base elsewhere."""
         newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
+        if self.base[2] > 0.0 and xform is None:  # a pedestal, only to be seen
+            x, y, z = self.base[:3]
+            config = newton.ModelBuilder.ShapeConfig(density=0.0, has_shape_collision=False)
+            config.has_particle_collision = False
+            look = {"color": (0.30, 0.31, 0.33), "label": f"{label}/pedestal"}
+            place = wp.transform(wp.vec3(x, y, 0.5 * z), wp.quat_identity())
+            builder.add_shape_box(-1, xform=place, hx=0.08, hy=0.08, hz=0.5 * z, cfg=config, **look)
         return self.robot.add_to(builder, xform=base_pose(self.base) if xform is None else xform, label=label)
 
 
@@ -180,14 +199,16 @@ def place_robot(
     over: Sequence[float] = (0.45, 0.0),
     ranges: Sequence[float] = (0.09, 0.16),
     height: float = 0.24,
+    also: Sequence[Sequence[float]] = (),
     base: Sequence[float] | None = None,
     grip_force: float = 40.0,
     grip_way: float | None = 0.01,
 ) -> TableRobot:
     """Place a loaded robot at the table, so that it reaches what a task needs with the tool pointing down.
 
-    Distance and direction of the base are searched: the most places first, then the middle of what serves.
-    Where not all is in reach, the ranges shrink about their middle; `TableRobot.share` says by how much.
+    Distance, direction and height of the base are searched: the most places first, then the least height, then the
+    middle of what serves. Where not all is in reach, the ranges shrink about their middle, and so do the heights of
+    home pose and places; `TableRobot.share` says by how much.
 
     Args:
         robot: The robot, with a gripper of two fingers.
@@ -196,6 +217,7 @@ def place_robot(
         over: Middle of the places on the table [m], shape (2,).
         ranges: Half-widths of the places in x and y [m].
         height: Highest place over the table [m].
+        also: Places that do not move where the ranges shrink [m], shape (N, 3).
         base: Where the base stands, x, y, z [m] and rotation [rad]; searched if omitted.
         grip_force: Largest force of a finger on what it holds [N]; what the file's drive leaves over after the dry
             friction of the finger's joints, if that is less.
@@ -213,7 +235,7 @@ def place_robot(
     if robot.gripper is None:
         raise ConfigError(
             f"robot {robot.name!r} has no gripper, which this task needs",
-            hint="name its joints: load(..., gripper={'joint': (closed, open)}), or use a robot that has one",
+            hint="name its joints: load(..., gripper={'joint': (closed, open)}), or give it a hand: load(..., hand=)",
         )
     jaw = ParallelJaw.of(robot)
     chain = serial_chain(robot, jaw.frame)
@@ -222,22 +244,34 @@ def place_robot(
             f"robot {robot.name!r} has {len(chain.joints)} joints between base and tool, expected 5 to {JOINT_MAX}",
             hint="write control.joint_target_q yourself, see RobotDescription.with_opening",
         )
-    box = np.stack(np.meshgrid([-1.0, 1.0], [-1.0, 1.0], [0.02, height], indexing="ij"), axis=-1).reshape(-1, 3)
-    given = None if base is None else [tuple(float(value) for value in base)]
+    loose = [robot.joint_names[j] for j in chain.joints if robot.drives[j] is None]
+    if loose:
+        raise ConfigError(
+            f"joints between base and tool of robot {robot.name!r} have no drive: {', '.join(loose)}",
+            hint="give each an actuator in the file; a base that floats is held with load(..., floating=False)",
+        )
     # The fingers may change sides: half a turn about the tool, which may free the last joint's range.
     half = Rotation.from_quat(jaw.frame[3:]) * Rotation.from_rotvec([0.0, 0.0, np.pi])
     other = (*jaw.frame[:3], *half.as_quat().tolist())
     jaws = [jaw, replace(jaw, frame=other)]
+    bases = [[tuple(map(float, base))]] if base is not None else [_bases(chain, over, up) for up in _HEIGHTS]
     best: tuple[float, ParallelJaw, Any, Array] | None = None
-    for share in (1.0, 0.75, 0.5, 0.3):
-        places = box * [share * ranges[0], share * ranges[1], 1.0] + [*over, 0.0]
-        points = np.concatenate([np.array([home_position] * 3, float), places])
-        yaw = np.array([0.0, _YAW, -_YAW] + [0.0] * len(box))
-        found = [_placed(robot, one, given, over, points, yaw) for one in jaws]
-        found = [one for one in found if one is not None]
-        if found:
-            _, chosen, placed, q = min(found, key=lambda one: one[0])
-            best = share, chosen, placed, q
+    home = np.array(home_position, float)
+    for share in _SHARES:
+        if share < 1.0:
+            home[2] = max(share * home_position[2], min(home_position[2], _LOW))
+        box = np.stack(np.meshgrid([-1.0, 1.0], [-1.0, 1.0], [0.02, max(share * height, home[2])], indexing="ij"), -1)
+        places = box.reshape(-1, 3) * [share * ranges[0], share * ranges[1], 1.0] + [*over, 0.0]
+        points = np.concatenate([np.array([home] * 3), places, np.reshape(np.array(also, float), (-1, 3))])
+        yaw = np.array([0.0, _YAW, -_YAW] + [0.0] * (len(points) - 3))
+        for some in bases:
+            found = [_placed(robot, one, some, points, yaw) for one in jaws]
+            found = [one for one in found if one is not None]
+            if found:
+                _, chosen, placed, q = min(found, key=lambda one: one[0])
+                best = share, chosen, placed, q
+                break
+        if best is not None:
             break
     if best is None:
         raise ConfigError(
@@ -246,6 +280,7 @@ def place_robot(
             hint="use a larger robot, a lower home_position, or name its tool: load(..., end_effector=, tool_offset=)",
         )
     share, jaw, placed, q = best
+    home_position = home.tolist()
     gaps = np.maximum.accumulate([gap_of(robot, jaw, s) for s in np.linspace(0.0, 1.0, _OPENINGS)])
     gaps = np.maximum(gaps, 0.0) + 1.0e-7 * np.arange(_OPENINGS)  # ascending
     jaw = replace(jaw, opening=float(gaps[-1]))
@@ -316,7 +351,7 @@ def _with_grip(
 
 
 def _placed(
-    robot: RobotDescription, jaw: ParallelJaw, given: list[Any] | None, over: Sequence[float], points: Array, yaw: Array
+    robot: RobotDescription, jaw: ParallelJaw, bases: list[Any], points: Array, yaw: Array
 ) -> tuple[float, ParallelJaw, Any, Array] | None:
     """Return how far from home, the jaw, the base, and the coordinates over the first point; None if none reaches all.
 
@@ -324,12 +359,17 @@ def _placed(
     and leaves the last joint room to turn the tool.
     """
     chain = serial_chain(robot, jaw.frame)
-    bases = _bases(chain, over) if given is None else given
-    count = len(points)
-    rows, turns = np.tile(points, (len(bases), 1)), np.tile(yaw, len(bases))
-    q, error = _reach(chain, np.repeat(np.array(bases), count, axis=0), rows, turns, chain.home)
-    reached = (error.reshape(-1, count) <= _NEAR).all(axis=1)
-    at_home = q.reshape(-1, count, q.shape[1])[:, 0]
+    at_home, error = _reach(chain, np.array(bases), np.tile(points[0], (len(bases), 1)), yaw[:1], chain.home, bent=True)
+    reached = error <= _NEAR
+    for some in (slice(3, None), slice(1, 3)):  # the places are what most bases do not reach
+        left = np.flatnonzero(reached)
+        if not len(left):
+            return None
+        count = len(points[some])
+        rows, turns = np.tile(points[some], (len(left), 1)), np.tile(yaw[some], len(left))
+        starts = np.repeat(at_home[left], count, axis=0)
+        _, error = _reach(chain, np.repeat(np.array(bases)[left], count, axis=0), rows, turns, starts)
+        reached[left] = (error.reshape(-1, count) <= _NEAR).all(axis=1)
     middles = []
     for turn in dict.fromkeys(one[3] for one in bases):
         chosen = [k for k in np.flatnonzero(reached) if bases[k][3] == turn]
@@ -343,41 +383,58 @@ def _placed(
     return change[k], jaw, bases[k], at_home[k]
 
 
-def _bases(chain: SerialChain, over: Sequence[float]) -> list[Any]:
-    """Return places of the base: on the near side of the table, at several distances, turned by quarter turns."""
+def _bases(chain: SerialChain, over: Sequence[float], up: float) -> list[Any]:
+    """Return places of the base: at a height, at several distances on the near side, turned by quarter turns."""
+    low, high = chain.span
+    # The first joint of most arms turns the base by itself.
+    free = abs(chain.axis[0, 2]) > 0.99 and not chain.slide[0] and high[0] - low[0] > _FREE
     return [
-        (float(over[0] - share * chain.reach), float(over[1]), 0.0, turn)
-        for turn in (0.0, 0.5 * math.pi, -0.5 * math.pi, math.pi)
+        (float(over[0] - share * chain.reach), float(over[1]), up, turn)
+        for turn in ((0.0,) if free else (0.0, 0.5 * math.pi, -0.5 * math.pi, math.pi))
         for share in np.linspace(0.25, 0.95, 15)
     ]
 
 
-def _reach(chain: SerialChain, base: Array, points: Array, yaw: Array, start: Array) -> tuple[Array, Array]:
+def _reach(
+    chain: SerialChain, base: Array, points: Array, yaw: Array, start: Array, *, bent: bool = False
+) -> tuple[Array, Array]:
     """Return coordinates that hold the tool at points of the world, pointing down, and what is missing [m].
 
-    The iteration begins in the home pose, then in two other ones for what was not reached.
+    The iteration begins in the home pose, then in other ones for what was not reached. A joint below the table's top
+    counts as not reached.
 
     Args:
         chain: The chain in the base frame.
         base: Where the base stands for each point, x, y, z [m] and rotation [rad], shape (N or 1, 4).
         points: The points, shape (N, 3).
         yaw: Rotation of the tool about the vertical there [rad], shape (N,).
-        start: The home pose.
+        start: The home pose, shape (n,) or (N, n).
+        bent: Whether more poses are tried: with the elbow up, down and to the sides.
     """
-    base = np.broadcast_to(base, (len(points), 4))
+    base, yaw = np.broadcast_to(base, (len(points), 4)), np.broadcast_to(yaw, len(points))
     local = _about_z(-base[:, 3]).apply(points - base[:, :3])
     turns = _about_z(yaw - base[:, 3]).as_matrix() @ _DOWN
     low, high = chain.span
-    starts = [start, np.clip(0.5 * (low + high), low, high)]
-    bent = starts[1].copy()
-    bent[1::2] += 0.25 * (high - low)[1::2]
-    q, error = chain.inverse(local, turns, starts[0], iterations=80)
-    for other in (starts[1], bent):
-        left = np.flatnonzero(error > _NEAR)
+    middle, quarter = 0.5 * (low + high), 0.25 * (high - low)
+    odd = np.arange(len(low)) % 2
+    starts = [middle, middle + quarter * odd]
+    if bent:
+        starts += [middle + quarter * np.resize(signs, len(low)) for signs in _BENT]
+
+    def solved(rows: NDArray[np.int64], begin: Array) -> tuple[Array, Array]:
+        q, error = chain.inverse(local[rows], turns[rows], begin, iterations=80)
+        return q, np.where(chain.lowest(q) + base[rows, 2] < 0.0, np.inf, error)
+
+    q, error = solved(np.arange(len(points)), start)
+    for other in starts:
+        # Where a pose is chosen to begin with, one at the end of a joint's range serves only if there is no other.
+        tight = error + _NEAR * (np.minimum(q - low, high - q).min(axis=1) < _ROOM) if bent else error
+        left = np.flatnonzero(tight > _NEAR)
         if not len(left):
             break
-        again, missing = chain.inverse(local[left], turns[left], other, iterations=80)
-        better = missing < error[left]
+        again, missing = solved(left, other)
+        more = missing + _NEAR * (np.minimum(again - low, high - again).min(axis=1) < _ROOM) if bent else missing
+        better = more < tight[left]
         q[left[better]], error[left[better]] = again[better], missing[better]
     return q, error
 
@@ -389,7 +446,7 @@ def _about_z(angle: Array) -> Rotation:
 
 def _closed_loops(robot: RobotDescription, joint_q: Array) -> Array:
     """Return joint coordinates with the loops closed by the passive joints, within the limits."""
-    model = importlib.import_module("mujoco").MjModel.from_xml_string(robot.mjcf)
+    model = robot.model
     passive = [robot.joint_names.index(name) for name in robot.passive_joints]
     data = settled(model, model.qpos0 + joint_q, passive)
     return np.clip(np.asarray(data.qpos) - model.qpos0, robot.joint_lower, robot.joint_upper)

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from softmode.splats.reference_views import orbit_poses, render_mesh
     from softmode.splats.rigid_splats import RigidSplats, RigidSplatsSkin
     from softmode.splats.splats import Splats, up_rotation
-    from softmode.splats.threaded_rasterizer import ThreadedRasterizer
 
 __all__ = [
     "CONVENTIONS",
@@ -46,7 +45,6 @@ __all__ = [
     "SplatCamera",
     "SplatRasterizer",
     "Splats",
-    "ThreadedRasterizer",
     "ViewArrays",
     "ViewVariation",
     "make_plush",

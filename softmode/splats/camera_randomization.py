@@ -55,11 +55,6 @@ class CameraRandomization:
             hint = "Give half the width of the range around the described value"
             require_number(item.name, getattr(self, item.name), at_least=0.0, below=limit, hint=hint)
 
-    @property
-    def changes_lens(self) -> bool:
-        """Whether worlds get different intrinsics."""
-        return self.focal > 0.0 or self.principal_point > 0.0
-
 
 class ViewVariation:
     """What the views of a `SplatCamera` differ in beside their description; draws anew for chosen worlds.

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from softmode.errors import AssetError
+from softmode.files import damage_errors
 from softmode.foreign.child.surface import GREY as GREY
 from softmode.foreign.child.surface import gathered
-from softmode.foreign.process import invalid_data
 
 if TYPE_CHECKING:
     import trimesh
@@ -37,6 +37,10 @@ class ColoredMesh:
     """Images, first row at v = 1, each of shape (height, width, 3)."""
     name: str = "mesh"
     """Where the mesh comes from; used in messages."""
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """What the corners lack to the file's own coordinates [m], where these are too far out for float32."""
+    notes: tuple[str, ...] = ()
+    """What was read from the file in another way than it was meant."""
 
     def __post_init__(self) -> None:
         """Refuse what has no surface."""
@@ -62,7 +66,7 @@ class ColoredMesh:
         Raises:
             AssetError: If there are no triangles, they have no area, a number is not finite, or a part is damaged.
         """
-        with invalid_data(name):
+        with damage_errors(name):
             return cls(**gathered(source), name=name)
 
     @property

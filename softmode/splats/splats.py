@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -54,6 +54,12 @@ class Splats:
     """Spherical-harmonic coefficients of the colour, shape (N, K, 3), K = (degree + 1)^2 in {1, 4, 9, 16}."""
     name: str = "splats"
     """Where the splats come from (a file name); used in messages."""
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """What `means` lack to the file's own coordinates [m], where these are too far out for float32."""
+    notes: tuple[str, ...] = ()
+    """What was read from the file in another way than it was meant."""
+    dropped_count: int = 0
+    """Number of splats of the file that were left out: not finite, or without rotation or size."""
 
     def __post_init__(self) -> None:
         """Convert, validate, normalise and freeze the arrays."""
@@ -105,7 +111,7 @@ class Splats:
             bad = np.flatnonzero(~good)
             raise AssetError(
                 f"{self.name}: {field} of {len(bad)} of {len(good)} splats holds {problem} (first: splat {bad[0]})",
-                hint="Remove the damaged splats or export the asset again",
+                hint="Remove them (`softmode splat convert FILE CLEAN.ply --drop-invalid`), or export the asset again",
             )
 
     @property
@@ -144,10 +150,13 @@ class Splats:
     def cropped(self, low: ArrayLike, high: ArrayLike) -> Splats:
         """Return the splats whose centres lie in the box between `low` and `high` [m], each of shape (3,).
 
-        Cuts an object out of its capture, for example off the ground it was captured on. Infinite bounds are allowed.
+        Cuts an object out of its capture, for example off the ground it was captured on. Infinite bounds are allowed;
+        those of a capture with an `offset` are in its own coordinates.
         """
-        inside = (self.means >= np.asarray(low)).all(axis=1) & (self.means <= np.asarray(high)).all(axis=1)
-        return self.subset(inside)
+        low, high = (
+            np.asarray(bound) - self.offset if any(self.offset) else np.asarray(bound) for bound in (low, high)
+        )
+        return self.subset((self.means >= low).all(axis=1) & (self.means <= high).all(axis=1))
 
     def with_sh_degree(self, degree: int) -> Splats:
         """Return the splats with the spherical harmonics cut to `degree` (no more than they have)."""
@@ -174,10 +183,12 @@ class Splats:
         require_number("scale", scale, above=0.0)
         means = scale * self.means.astype(np.float64) @ matrix.T + np.asarray(translation, dtype=np.float64)
         quats, sh = self.quats, self.sh
+        x, y, z = (scale * matrix @ self.offset).tolist()
         if rotation is not None:
             quats = multiply_quats(quats_from_rotations(matrix), self.quats)
             sh = rotate_sh(self.sh, matrix)
-        return replace(self, means=means, quats=quats, scales=self.scales * np.float32(scale), sh=sh)
+        scales = self.scales * np.float32(scale)
+        return replace(self, means=means, quats=quats, scales=scales, sh=sh, offset=(x, y, z))
 
     def deformed(self, means: ArrayLike, gradients: ArrayLike) -> Splats:
         """Return the splats after a deformation: covariances become F Sigma F^T, view-dependent colour turns along.
@@ -299,9 +310,12 @@ def joined(parts: list[Splats], name: str) -> Splats:
     """Return several sets of splats as one of the highest degree among them."""
     if len(parts) == 1:
         return parts[0]
-    columns = ("means", "quats", "scales", "opacities")
-    joint = {column: np.concatenate([getattr(part, column) for part in parts]) for column in columns}
-    return Splats(**joint, sh=padded_sh(parts), name=name)
+    columns = ("quats", "scales", "opacities")
+    joint: dict[str, Any] = {column: np.concatenate([getattr(part, column) for part in parts]) for column in columns}
+    offset = parts[0].offset
+    means = [part.means + np.subtract(part.offset, offset) if part.offset != offset else part.means for part in parts]
+    notes = tuple(dict.fromkeys(note for part in parts for note in part.notes))
+    return Splats(means=np.concatenate(means), **joint, sh=padded_sh(parts), name=name, offset=offset, notes=notes)
 
 
 def padded_sh(parts: Sequence[Splats], width: int | None = None) -> NDArray[np.float32]:

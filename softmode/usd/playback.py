@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softmode.errors import AssetError, ConfigError
+from softmode.files import REEXPORT, damage_errors
 from softmode.foreign import process
 from softmode.objects.soft_object import SoftObject
 from softmode.objects.stage_bundle import body_of
@@ -21,7 +21,6 @@ from softmode.usd.dents import NO_DENTS, Dents
 from softmode.usd.handles import coordinates_from_handles, world_coordinates
 
 Array = NDArray[np.float64]
-_LIMITS = process.Limits()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -83,23 +82,7 @@ def read_animation(path: str | os.PathLike[str]) -> UsdPlayback:
         MissingExtraError: If the extra `[usd]` is not installed.
     """
     name = f"OpenUSD file {path}"
-    with tempfile.TemporaryDirectory() as folder:
-        answer = process.ask(animation_request(path, f"{folder}/answer"), name=name)
-    return animation_from_answer(answer, name)
-
-
-def animation_request(path: str | os.PathLike[str], answer: str) -> dict[str, Any]:
-    """Return the request for the process of its own; `answer` is where its answer goes."""
-    request = process.make_request("animation", path, answer, asset_root=None, limits=_LIMITS)
-    return {**request, "most": MAX_SPLATS}
-
-
-def animation_from_answer(answer: process.Answer, name: str) -> UsdPlayback:
-    """Return the animation that the process sent.
-
-    Raises:
-        AssetError: If it contradicts itself.
-    """
+    answer = process.read("animation", path, name=name, most=MAX_SPLATS)
     stage = answer.described
     if stage["up"] != "Z" or stage["meters"] != 1.0:
         raise AssetError(
@@ -114,7 +97,7 @@ def animation_from_answer(answer: process.Answer, name: str) -> UsdPlayback:
     rate = float(stage["rate"])
     if not (np.isfinite(rate) and rate > 0.0):
         raise AssetError(f"{name}: timeCodesPerSecond is {rate}", hint="Set it to the number of time codes in a second")
-    with process.invalid_data(name):
+    with damage_errors(name):
         bodies = tuple(_played(sent, answer.arrays, rate, name) for sent in stage["bodies"])
     return UsdPlayback(fps=rate, bodies=bodies)
 
@@ -129,13 +112,13 @@ def _played(sent: dict[str, Any], arrays: list[NDArray[Any]], rate: float, name:
     matrices = np.array([arrays[k] for k in sent["handles"]]).reshape(len(codes), len(body.handle_degrees), 4, 4)
     quadratic = np.array([arrays[k] for k in sent["quadratic"]]).reshape(len(codes), curved, 6, 3)
     if not all(np.isfinite(values).all() for values in (codes, places, matrices, quadratic)):
-        raise AssetError(f"{source}: its time samples are not all finite", hint=process.REEXPORT)
+        raise AssetError(f"{source}: its time samples are not all finite", hint=REEXPORT)
     dents = _dents(sent["dents"], arrays, body.surface_count, len(codes), source)
     local = coordinates_from_handles(body, matrices, quadratic)
     linear = places[:, :3, :3].transpose(0, 2, 1)
     scale = np.cbrt(np.linalg.det(linear))
     if not (scale > 0.0).all():
-        raise AssetError(f"{source}: its place is mirrored or flat", hint=process.REEXPORT)
+        raise AssetError(f"{source}: its place is mirrored or flat", hint=REEXPORT)
     world = [
         world_coordinates(body, q, matrix / s, place[3, :3], float(s))
         for q, matrix, s, place in zip(local, linear, scale, places, strict=True)
@@ -165,5 +148,5 @@ def _dents(sent: list[list[int]], arrays: list[NDArray[Any]], count: int, frames
     for one in dents:
         known = len(one.samples) == len(one.vectors) and bool(((one.samples >= 0) & (one.samples < count)).all())
         if not known or not np.isfinite(one.vectors).all():
-            raise AssetError(f"{source}: its dents are not those of {count} samples", hint=process.REEXPORT)
+            raise AssetError(f"{source}: its dents are not those of {count} samples", hint=REEXPORT)
     return dents

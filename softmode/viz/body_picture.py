@@ -131,7 +131,7 @@ def _moved(body: ReducedBody, splats: Splats, modes: Array) -> list[Splats]:
     """Return the splats displaced by each mode, so far that the largest displacement is a fixed part of the size."""
     from softmode.deformables.skinning.skin_splats import average_basis
 
-    value, gradient = average_basis(lambda x: body.evaluate(x)[0], splats.means, splats.covariances())
+    value, gradient = average_basis(body, splats.means, splats.covariances())
     size, found = float(np.linalg.norm(np.ptp(body.bounds, axis=0))), []
     for q in modes:
         motion = value @ q

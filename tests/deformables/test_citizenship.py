@@ -13,7 +13,6 @@ import warp as wp
 from newton.solvers import SolverBase, SolverMuJoCo
 from newton.solvers.experimental.coupled import ModelView  # pyright: ignore[reportMissingImports]
 
-from softmode.deformables.coupling.proxy import SolverReducedProxy
 from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_pins, add_reduced_body, register_custom_attributes
@@ -95,7 +94,7 @@ class Run:
         return self.states[0].softmode.q.numpy().copy()
 
 
-KINDS = pytest.mark.parametrize("kind", [SolverReduced, SolverCoupledReduced, SolverReducedProxy])
+KINDS = pytest.mark.parametrize("kind", [SolverReduced, SolverCoupledReduced])
 
 
 # -- notifications -----------------------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -237,20 +238,31 @@ def test_averages_of_quadratic_functions_are_exact() -> None:
     def values(x: np.ndarray) -> np.ndarray:
         return constant + x @ slope.T + 0.5 * np.einsum("ni,kij,nj->nk", x, hessian, x)
 
-    basis, gradient = average_basis(values, case.means, case.covariances)
+    def evaluate(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return values(x), slope + np.einsum("kij,nj->nki", hessian, x)
+
+    def functions(narrow: float) -> SimpleNamespace:
+        return SimpleNamespace(values=values, evaluate=evaluate, narrow=narrow)
+
+    basis, gradient = average_basis(functions(0.0), case.means, case.covariances)
     expected = values(case.means) + 0.5 * np.einsum("kij,nij->nk", hessian, case.covariances)
     # A point is as wide as 1e-5 of the object, at most: its average is off by the square of that.
     np.testing.assert_allclose(basis, expected, atol=1e-10)
-    np.testing.assert_allclose(gradient, slope + np.einsum("kij,nj->nki", hessian, case.means), atol=1e-8)
+    np.testing.assert_allclose(gradient, evaluate(case.means)[1], atol=1e-8)
+    # Splats that are narrow take both at their centre: the median of the widths says which.
+    width = np.sqrt(3.0 * np.linalg.eigvalsh(case.covariances)[:, 2])
+    narrow = width <= np.median(width)
+    mixed = average_basis(functions(float(np.median(width))), case.means, case.covariances)
+    np.testing.assert_array_equal(mixed[0][narrow], values(case.means)[narrow])
+    np.testing.assert_array_equal(mixed[0][~narrow], basis[~narrow])
 
 
 def test_average_of_a_step_is_bounded_by_its_height() -> None:
     """Across a jump of one between the cubature points F is 1 / (2 sqrt(3) sigma), however thin the jump is."""
     sigma = 2e-3
     for width in (1e-4, 1e-6):
-        _, gradient = average_basis(
-            lambda x, w=width: 0.5 * np.tanh(x[:, :1] / w), np.zeros((1, 3)), sigma**2 * np.eye(3)[None]
-        )
+        step = SimpleNamespace(values=lambda x, w=width: 0.5 * np.tanh(x[:, :1] / w), narrow=0.0)
+        _, gradient = average_basis(step, np.zeros((1, 3)), sigma**2 * np.eye(3)[None])
         np.testing.assert_allclose(gradient[0, 0], [1.0 / (2.0 * np.sqrt(3.0) * sigma), 0.0, 0.0], rtol=1e-9)
 
 

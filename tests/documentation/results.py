@@ -99,9 +99,16 @@ def _rendering_gradients(names: dict[str, Any], folder: Path) -> None:
 
 @_result("docs/sensing.md")
 def _sensing(names: dict[str, Any], folder: Path) -> None:
-    """The right finger, 0.5 mm deep in the cube, is pushed away along -y."""
+    """The right finger, 0.5 mm deep in the cube, is pushed away along -y; the ground carries the weight of the other.
+
+    The patch of the cube at rest is its bottom.
+    """
     assert names["fingers"].total_force.numpy()[0, 1, 1] < 0.0
     assert names["surface"].pressure.numpy().max() > 0.0
+    force = names["ground"].total_force.numpy()[0, 0]
+    weight = names["density"] * names["edge"] ** 3 * 9.81
+    np.testing.assert_allclose(force, [0.0, 0.0, -weight], atol=1e-3 * weight)
+    np.testing.assert_allclose(names["surface"].total_area.numpy()[0], names["edge"] ** 2, rtol=0.05)
 
 
 @_result("docs/gradients.md")
@@ -175,15 +182,6 @@ def _tune_a_material(names: dict[str, Any], folder: Path) -> None:
         dent = names["dents"][modulus]
         np.testing.assert_allclose(dent, 0.30 * size * pressure / modulus, rtol=0.1)
         np.testing.assert_allclose(sink - dent, 0.5 * pressure * edge / modulus, rtol=0.02, atol=5e-5)
-
-
-@_result("docs/howto/read_forces.md")
-def _read_forces(names: dict[str, Any], folder: Path) -> None:
-    """The ground carries the weight; the patch is the bottom of the cube."""
-    force = names["ground"].total_force.numpy()[0, 0]
-    weight = names["density"] * names["edge"] ** 3 * 9.81
-    np.testing.assert_allclose(force, [0.0, 0.0, -weight], atol=1e-3 * weight)
-    np.testing.assert_allclose(names["surface"].total_area.numpy()[0], names["edge"] ** 2, rtol=0.05)
 
 
 @_result("docs/howto/train.md")

@@ -16,7 +16,7 @@ from tests.documentation.setups import SETUPS
 WITH_PYTHON = [page for page in PAGES if any(fence.mark != "not run" for fence in fences(page, "python"))]
 
 DEAR = {
-    "docs/scenes.md",
+    "docs/examples.md",
     "docs/environments.md",
     "docs/howto/tune_a_material.md",
     "docs/body_tool.md",

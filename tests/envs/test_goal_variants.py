@@ -49,7 +49,7 @@ def test_rewards_are_computed_again(soft_env: MakeEnv, name: str) -> None:
 
     The environments are others: as they are registered they pay the sparse reward, which a scripted push tells.
     """
-    env: Any = soft_env(f"softmode/{name}Goal-v0", reward="distance").unwrapped
+    env: Any = soft_env(f"softmode/{name}Goal-v0", reward_mode="dense").unwrapped
     env.reset(seed=1)
     env.action_space.seed(1)
     for _ in range(3):
@@ -111,6 +111,6 @@ def test_hindsight_relabels() -> None:
 def test_wrong_configurations_are_refused() -> None:
     """An unknown reward, and a goal for yaw, which a place has not."""
     with pytest.raises(ConfigError, match="reward"):
-        LiftSoftGoalConfig(reward="dense")
+        LiftSoftGoalConfig(reward_mode="distance")
     with pytest.raises(ConfigError, match="yaw_tolerance"):
         PushSoftGoalConfig(yaw_tolerance=0.3)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import pickle
+import weakref
 from typing import Any
 
 import gymnasium as gym
@@ -17,6 +18,7 @@ from softmode.deformables.model.status import status_reasons
 from softmode.envs.task_kernels import bound_observation
 from softmode.envs.tasks.lift_soft.task import LiftSoftConfig, LiftSoftEnv
 from softmode.errors import ConfigError, MaterialError
+from softmode.pause import collector_paused
 from tests.envs.conftest import MakeEnv
 
 
@@ -88,6 +90,20 @@ def test_a_seeded_reset_leaves_nothing_of_before(lift: LiftSoftEnv) -> None:
     unread = ("_before", "stick_point", "hessian.", "scene.actions", "task.reward")
     assert not [name for name in different if not any(part in name for part in unread)]
     assert not {"state.softmode.dt_before", "hessian.cached"} & set(different) and first.random == second.random
+
+
+def test_a_closed_environment_needs_no_collector() -> None:
+    """Task, scene and model of an environment that was used and closed are freed by counting references alone."""
+    with collector_paused():
+        env: Any = gym.make("softmode/LiftSoft-v0", obs_type="state")
+        env.reset(seed=0)
+        env.step(env.action_space.sample())
+        task = env.unwrapped.task
+        left = [weakref.ref(owner) for owner in (task, task.scene, task.scene.model)]
+        del task
+        env.close()
+        del env
+        assert [owner() for owner in left] == [None] * 3
 
 
 def test_materials_in_which_sound_is_too_fast_are_refused(lift: LiftSoftEnv) -> None:

@@ -228,7 +228,9 @@ def test_posts_are_posts() -> None:
         ShapeSoftConfig(objects=ObjectSet([POST, low]))
     with pytest.raises(ConfigError, match="goal_object: expected extents of the same height"):
         ShapeSoftConfig(
-            objects=ObjectSet([POST, replace(POST, extents=(0.03, 0.03, 0.13))]), goal_object=POST, reward="log_mass"
+            objects=ObjectSet([POST, replace(POST, extents=(0.03, 0.03, 0.13))]),
+            goal_object=POST,
+            reward_mode="log_mass",
         )
 
 

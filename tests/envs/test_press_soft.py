@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -207,3 +208,27 @@ def test_a_pad_must_not_reach_the_fingers(press: PressSoftEnv) -> None:
 def test_scripted_policy_succeeds_on_twenty_of_twenty_seeds(soft_env: MakeEnv, episode: Episodes) -> None:
     """20 of 20 seeds with random stiffness, place and force."""
     assert_success(episode(soft_env("softmode/PressSoft-v0")))
+
+
+def test_fields_are_keywords_and_success_alone_can_be_paid(soft_env: MakeEnv) -> None:
+    """`gym.make` takes fields of the configuration; what it does not know is said, with the nearest names.
+
+    Sparse pays 1 while the task counts as solved, as `success` and `is_success` say, and keeps the terms in the infos.
+    """
+    env = soft_env("softmode/PressSoft-v0", reward_mode="sparse", image_size=64, youngs_modulus_range=(1.0e5, 1.0e5))
+    bare: Any = env.unwrapped
+    assert bare.config == PressSoftConfig(reward_mode="sparse", image_size=64, youngs_modulus_range=(1.0e5, 1.0e5))
+    with pytest.raises(ConfigError, match="before the first reset"):
+        bare.step(IDLE)
+    observation, info = env.reset(seed=0)
+    assert info["parameters"]["youngs_modulus"] == pytest.approx(1.0e5)
+    policy, paid = scripted_policy(bare), []
+    for _ in range(120):
+        observation, reward, _, _, info = env.step(policy(observation))
+        assert reward == info["is_success"] == info["success"]
+        paid.append((reward, sum(info["reward_terms"].values())))
+    assert paid[0][0] == 0.0 and paid[-1][0] == 1.0 and all(dense > 0.0 for _, dense in paid[-10:])
+    with pytest.raises(ConfigError, match=r"'image_sise' is no option.*Nearest: image_size"):
+        gym.make("softmode/PressSoft-v0", image_sise=64)
+    with pytest.raises(ConfigError, match="reward_mode is 'shaped'"):
+        gym.make("softmode/PressSoft-v0", reward_mode="shaped")

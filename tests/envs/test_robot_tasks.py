@@ -13,9 +13,9 @@ from softmode.envs.robots import with_robot
 from softmode.envs.scripted import scripted_policy
 from softmode.envs.tasks.lift_soft.scripted import ScriptedLift
 from softmode.envs.tasks.lift_soft.task import LiftSoftConfig, LiftSoftEnv, LiftSoftVectorEnv
-from softmode.envs.tasks.place_in_bin.task import PlaceInBinEnv
 from softmode.envs.tasks.press_soft.task import PressSoftConfig, PressSoftEnv
 from softmode.envs.tasks.push_soft.task import PushSoftConfig, PushSoftEnv
+from softmode.envs.tasks.rope_route.task import RopeRouteEnv
 from softmode.errors import ConfigError
 from softmode.robots.table_robot import TableRobot, tip_length
 from tests.robots.files import ARM5, MJCF, write_arm5, write_mjcf
@@ -104,7 +104,7 @@ def test_robots_and_tasks_that_do_not_fit(tmp_path: Path, arm5: Path) -> None:
     with pytest.raises(ConfigError, match="robot is a int"):
         LiftSoftEnv(robot=3)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="built-in arm only"):
-        PlaceInBinEnv(robot=arm5)
+        RopeRouteEnv(robot=arm5)
 
 
 def test_samples_of_the_pad_are_as_near_as_finger_tips_are_wide(arm5: Path, tmp_path: Path) -> None:

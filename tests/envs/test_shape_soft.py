@@ -170,7 +170,7 @@ def test_reward_is_computed_again_for_any_goals(shape: ShapeSoftEnv) -> None:
 
 def test_sparse_reward() -> None:
     """-1 away from the target and 0 at it."""
-    env = ShapeSoftEnv(config=ShapeSoftConfig(reward="sparse"))
+    env = ShapeSoftEnv(config=ShapeSoftConfig(reward_mode="sparse"))
     env.reset(seed=0)
     observation, reward, _, _, info = env.step(IDLE)
     assert reward == -1.0 == env.compute_reward(observation["achieved_goal"], observation["desired_goal"], info)
@@ -191,7 +191,7 @@ def test_success_takes_holding_still(shape: ShapeSoftEnv) -> None:
 def square() -> ShapeSoftEnv:
     """Return an environment of masses, whose targets a square post made, with the round one at the table."""
     made = replace(POST, shape="box", extents=(0.024, 0.024, 0.12))
-    return ShapeSoftEnv(config=ShapeSoftConfig(reward="log_mass", goal_object=made))
+    return ShapeSoftEnv(config=ShapeSoftConfig(reward_mode="log_mass", goal_object=made))
 
 
 def test_log_mass_is_the_distance_of_masses(shape: ShapeSoftEnv, square: ShapeSoftEnv) -> None:

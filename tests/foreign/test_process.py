@@ -33,9 +33,8 @@ def test_one_process_reads_all(tmp_path: Path) -> None:
         read_mesh(bad)
     limits = process.Limits(memory=2**20, memory_per_byte=0.0)
     (tmp_path / "b.obj").write_text(SQUARE * 50_000)
-    request = process.make_request("mesh", tmp_path / "b.obj", str(tmp_path / "answer"), asset_root=None, limits=limits)
     with pytest.raises(AssetError, match="more memory than is given"):
-        process.ask(request | {"want": "colors"}, name="a")
+        process.read("mesh", tmp_path / "b.obj", name="a", limits=limits, want="colors")
     assert read_mesh(good).area == pytest.approx(1.0) and kept() == first
 
 

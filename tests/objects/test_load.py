@@ -5,6 +5,7 @@ Builds objects, which is what it tests.
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -14,9 +15,13 @@ import pytest
 import trimesh
 
 from softmode.deformables import BuildOptions, Material
+from softmode.deformables.materials.material import warn_of_units
+from softmode.envs.task_config import TaskConfig
 from softmode.errors import ConfigError
 from softmode.objects import PRESETS, ObjectConfig, Placed, SoftObject, StifferColor, build_object, load, surface_cover
+from softmode.objects.mesh_file import read_mesh
 from softmode.objects.pose import seat_of
+from softmode.scenes.table_scene import TableSceneConfig
 from softmode.splats import make_plush, write_ply
 from softmode.splats.formats import read_splats
 
@@ -174,3 +179,37 @@ def test_load_and_build_object_make_one_body(tmp_path: Path) -> None:
     assert one.body.region_names == ("foot",) and one.body.driven_count > 0
     assert set(one.body.stiffness_scale) == {1.0, 3.0}
     assert one.body.offset[0] - quadrature.weights @ quadrature.points[:, 0] / quadrature.volume > 0.01
+
+
+def test_units_that_no_solid_has_are_warned_of() -> None:
+    """Young's modulus in MPa and density in g/cm^3 are told from Pa and kg/m^3, with the value that is meant."""
+    given = Material(youngs_modulus=0.05, density=1.2)
+    with pytest.warns(UserWarning) as caught:
+        warn_of_units(given, "toy")
+    told = [str(one.message) for one in caught]
+    assert "if it is in MPa, give 50000" in told[0] and "if it is in g/cm^3, give 1200" in told[1]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn_of_units(Material(), "toy")
+
+
+def test_sizes_from_a_millimetre_to_ten_metres() -> None:
+    """Objects may be so small or large; a task names the sizes that its table takes."""
+    for size in (0.001, 10.0):
+        made = ObjectConfig(size=size)
+        assert made.longest_edge == size
+        with pytest.raises(ConfigError, match="an object's size") as caught:
+            TaskConfig(scene=TableSceneConfig(object=made))
+        assert "5 mm to 1 m" in caught.value.hint
+    with pytest.raises(ConfigError, match="size"):
+        ObjectConfig(size=0.0005)
+
+
+def test_a_far_mesh_keeps_its_volume_and_tells_its_offset(tmp_path: Path) -> None:
+    """A mesh in coordinates of a map has the volume that it has at the origin, and its offset in the provenance."""
+    mesh = trimesh.creation.box((0.1, 0.08, 0.06))
+    mesh.apply_translation((4.0e5, 5.0e6, 100.0))
+    mesh.export(tmp_path / "far.obj", digits=9)
+    read = read_mesh(tmp_path / "far.obj")
+    np.testing.assert_allclose(np.ptp(read.corners, axis=(0, 1)), (0.1, 0.08, 0.06), atol=1e-6)
+    assert read.offset == (4.0e5, 5.0e6, 100.0)

@@ -105,7 +105,7 @@ def test_body_has_volume_size_and_material(name: str) -> None:
     shape = source.integrate()  # what its body is built from
     assert shape.volume == pytest.approx(volume_of_mesh(name), rel=0.01)
     assert source.splats.count == 6000
-    small = load(preset=name, size=0.03, splat_count=200)
+    small = load(name, size=0.03, splat_count=200)
     assert small.material == PRESETS[name].material
     assert small.body.volume == pytest.approx(shape.volume * (0.03 / np.ptp(shape.bounds, axis=0).max()) ** 3, rel=0.01)
     assert np.ptp(small.body.bounds, axis=0).max() == pytest.approx(0.03, rel=0.02)
@@ -126,7 +126,7 @@ def test_unknown_names_are_told_with_the_known_ones(capsys: pytest.CaptureFixtur
     with pytest.raises(ConfigError, match=r"no preset 'spnoge'") as caught:
         ObjectConfig(preset="spnoge")
     assert all(name in str(caught.value) for name in PRESETS)
-    with pytest.raises(AssetError, match=r"file spnoge: no such file. Check the path, or name a preset: bear"):
+    with pytest.raises(AssetError, match=r"file spnoge: no such file. Check the path, or name a preset: sponge, "):
         ObjectOptions(object=Path("spnoge")).configured(LiftSoftConfig())
     for command in (["objects", "show", "spnoge", "-o"], ["objects", "export", "spnoge"]):
         assert main([*command, str(tmp_path / "a.png")]) == 2

@@ -11,8 +11,6 @@ import pytest
 from tests.marks import rest_but
 from tests.oracle.held import STORED, TETRAHEDRA, against_elements, build_held
 
-LEAST = {("helix", 0.45): 0.94}
-"""Least work of gravity over that of finite elements, of all others 0.95."""
 CASES = [(name, float(ratio)) for name, ratios in json.loads(STORED.read_text()).items() for ratio in ratios]
 
 
@@ -25,7 +23,7 @@ def test_loads_and_frequencies(name: str, poissons_ratio: float) -> None:
         warnings.filterwarnings("ignore", ".*space_error", RuntimeWarning)
         body = build_held(name, poissons_ratio)
     works, frequencies = against_elements(body, name, poissons_ratio)
-    assert LEAST.get((name, poissons_ratio), 0.95) < works[:3].min() and works[:3].max() < 1.05
+    assert 0.95 < works[:3].min() and works[:3].max() < 1.05
     if name != "hollow box":  # Its end is the middle of a thin lid.
-        assert 0.88 < works[6:].min() and works[6:].max() < 1.05
-    assert np.abs(frequencies[:5] - 1.0).max() < (0.09 if name == "hollow box" else 0.06)
+        assert (0.91 if name == "plate, two edges" else 0.95) < works[6:].min() and works[6:].max() < 1.05
+    assert np.abs(frequencies[:5] - 1.0).max() < (0.06 if name == "plate, two edges" else 0.05)

@@ -197,7 +197,7 @@ def test_asset_root_widens_the_folder(tmp_path):
     assert robots.load(path, asset_root=tmp_path).joint_names == ("shoulder", "elbow", "left", "right")
 
 
-@pytest.mark.parametrize(("make", "words"), [("missing.xml", "does not exist"), ("folder.xml", "is a folder")])
+@pytest.mark.parametrize(("make", "words"), [("missing.xml", "does not exist"), ("folder.xml", "Is a directory")])
 def test_file_not_found(make, words, tmp_path):
     """The error names the path."""
     (tmp_path / "folder.xml").mkdir()

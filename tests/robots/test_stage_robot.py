@@ -331,3 +331,27 @@ def test_several_robots_and_damaged_files(tmp_path: Path) -> None:
     broken.write_text("#usda 1.0\ndef Xform {")
     with pytest.raises(AssetError, match=r"broken\.usda"):
         robots.load(broken)
+
+
+def test_mimic_of_physx_and_a_leader_that_is_not_there(tmp_path: Path) -> None:
+    """PhysX: q + gearing q_leader + offset = 0, the offset of a hinge in degrees; a leader that is no joint is refused.
+
+    With gearing 0.5 and offset 10 degrees, roll = -0.5 wrist - pi / 18; both get the range that they reach together.
+    """
+    stage = arm(tmp_path)
+    follower = stage.joint("roll")
+    follower.AddAppliedSchema("PhysxMimicJointAPI:rotZ")
+    leader = follower.CreateRelationship("physxMimicJoint:rotZ:referenceJoint")
+    leader.SetTargets([f"{JOINTS}/wrist"])
+    for name, value in (("gearing", 0.5), ("offset", 10.0)):
+        follower.CreateAttribute(f"physxMimicJoint:rotZ:{name}", Sdf.ValueTypeNames.Float).Set(value)
+    found = robots.load(stage.save())
+    (tie,) = found.ties
+    assert (tie.joint, tie.leader) == ("roll", "wrist")
+    assert (tie.ratio, tie.offset) == pytest.approx((-0.5, -math.pi / 18.0), abs=SINGLE)
+    wrist, roll = (found.joint_names.index(name) for name in ("wrist", "roll"))
+    ends = [tie.offset + tie.ratio * found.joint_upper[wrist], tie.offset + tie.ratio * found.joint_lower[wrist]]
+    assert [found.joint_lower[roll], found.joint_upper[roll]] == pytest.approx(ends)
+    leader.SetTargets([f"{JOINTS}/nothing"])
+    with pytest.raises(AssetError, match="no joint of it"):
+        robots.load(stage.save())

@@ -109,7 +109,7 @@ def test_compressed_ply_decodes_every_attribute(tmp_path: Path, coefficients: in
         (b"element chunk 2", b"element chunk 1", "the file holds"),
         (b"element vertex 300", b"element vertex 200", "the file holds"),
         (b"element sh 300", b"element sh 299", "the file holds"),
-        (b"element sh 300", b"element xx 300", "elements"),
+        (b"element vertex 300", b"element vortex 300", "elements"),
         (b"packed_scale", b"packed_scald", "unexpected properties"),
         (b"property float min_x", b"property uint min_x", "unexpected properties"),
         (b"property uchar f_rest_8", b"property uchar f_rest_9", "unexpected properties"),

@@ -245,9 +245,9 @@ def test_contradictory_stages(tmp_path: Path) -> None:
             read_splats(path)
         assert caught.value.hint
 
-    refused(lambda prim: prim.GetAttribute("scales").Set([(1, 1, 1)]), "scales has shape")
-    refused(lambda prim: prim.GetAttribute("positions").Set([(np.nan, 1, 1)] * 50), "means of 50 of 50")
-    refused(lambda prim: prim.GetAttribute("orientations").Set([Gf.Quatf(0, 0, 0, 0)] * 50), "length zero")
+    refused(lambda prim: prim.GetAttribute("scales").Set([(1, 1, 1)]), "1 scales for 50 splats")
+    refused(lambda prim: prim.GetAttribute("positions").Set([(np.nan, 1, 1)] * 50), "50 with means not finite")
+    refused(lambda prim: prim.GetAttribute("orientations").Set([Gf.Quatf(0, 0, 0, 0)] * 50), "50 without a rotation")
     refused(lambda prim: prim.GetAttribute("radiance:sphericalHarmonicsDegree").Set(2), "degree 2")
     refused(lambda prim: prim.GetAttribute("radiance:sphericalHarmonicsDegree").Set(-1), "degree -1")
     refused(

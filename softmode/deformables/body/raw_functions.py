@@ -27,8 +27,11 @@ class RawFunctions(Protocol):
         """Return at which of points (N, 3) within reach the functions can be evaluated, shape (N,)."""
         ...
 
-    def evaluate(self, points: Array, at: Array | None = None) -> tuple[Array, Array]:
-        """Return values (N, R) and gradients [1/m] (N, R, 3) within reach; all but the kernels `at` other points."""
+    def evaluate(self, points: Array, at: Array | None = None, *, gradients: bool = True) -> tuple[Array, Array]:
+        """Return values (N, R) and gradients [1/m] (N, R, 3) within reach; all but the kernels `at` other points.
+
+        Gradients that are not wanted may be (N, R, 0).
+        """
         ...
 
 
@@ -54,17 +57,18 @@ class SkinningFunctions:
         """Return at which of points (N, 3) within reach there are enough kernels: not in the gap between two leaves."""
         return self.kernels.covered(points)
 
-    def weights(self, points: Array, at: Array | None = None) -> tuple[Array, Array]:
+    def weights(self, points: Array, at: Array | None = None, *, gradients: bool = True) -> tuple[Array, Array]:
         """Return the skinning weights (N, J) and their gradients [1/m] (N, J, 3) at points within reach.
 
         The envelope and the blends are those `at` other points (N, 3) if these are given.
         """
-        shape = self.kernels.evaluate(points)
+        shape = self.kernels.evaluate(points, gradients=gradients)
         return self.skin.evaluate(*enveloped(shape if at is None else replace(shape, points=at), self.envelope))
 
-    def evaluate(self, points: Array, at: Array | None = None) -> tuple[Array, Array]:
+    def evaluate(self, points: Array, at: Array | None = None, *, gradients: bool = True) -> tuple[Array, Array]:
         """Return values (N, R) and gradients [1/m] (N, R, 3) within reach; all but the kernels `at` other points."""
-        return self.skin.products(*self.weights(points, at), points if at is None else at, self.length)
+        found = self.weights(points, at, gradients=gradients)
+        return self.skin.products(*found, points if at is None else at, self.length)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +88,7 @@ class QuadraticFunctions:
         """Return that there are enough kernels at all points (N, 3) within reach: one will do."""
         return np.ones(len(points), dtype=bool)
 
-    def evaluate(self, points: Array, at: Array | None = None) -> tuple[Array, Array]:
+    def evaluate(self, points: Array, at: Array | None = None, *, gradients: bool = True) -> tuple[Array, Array]:
         """Return values (N, 10 + 10 n) and gradients [1/m] (N, 10 + 10 n, 3) at points within reach."""
         one, flat = np.ones((len(points), 1)), np.zeros((len(points), 1, 3))
         whole = constant_handle(1).products(one, flat, points, self.length)

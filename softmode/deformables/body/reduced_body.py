@@ -48,7 +48,7 @@ RATIO_HARMLESS = 0.45
 """Poisson's ratio up to which functions made for any other serve."""
 _SOURCES = "sources."
 """What the names of the sources begin with in a file."""
-_CHUNK = 16384
+_CHUNK = 2048
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,6 +147,14 @@ class ReducedBody:
     """What is added to the distance of each pair [m], > 0, shape (D,)."""
     sources: Mapping[str, NDArray[Any]] | None = dataclasses.field(default=None, repr=False, compare=False)
     """What it was built from, for :func:`softmode.deformables.hold`, or None; see ``build.sources``."""
+
+    @property
+    def narrow(self) -> float:
+        """Width [m] over which the functions hardly bend, a quarter of the kernels' radius; see `average_basis`.
+
+        Gradients at the centre of splats so wide are off by 2 % of the mean gradient, by 5 % of one splat in a hundred.
+        """
+        return 0.25 * float(np.median(self.radii))
 
     @property
     def function_count(self) -> int:
@@ -260,24 +268,41 @@ class ReducedBody:
         Raises:
             BasisError: If points are not finite, or out of reach with outside="raise".
         """
-        x, inner, at, far = self._within_reach(points)
         if outside not in ("clamp", "raise"):
             raise ConfigError(f"outside: expected 'clamp' or 'raise', got {outside!r}")
+        x, inner, at, far = self._within_reach(points)
         if far.any() and outside == "raise":
             raise BasisError(
                 f"points: {int(far.sum())} of {len(x)} lie outside the body (first: row {int(far.argmax())})",
                 hint="Drop them, or pass outside='clamp'.",
             )
+        return self._evaluated(x, inner, at, far, axes=3)
+
+    def values(self, points: ArrayLike) -> Array:
+        """Evaluate the functions alone, (N, n), at rest points (N, 3) [m]: as `evaluate` in less than half the time.
+
+        Raises:
+            BasisError: If points are not finite.
+        """
+        return self._evaluated(*self._within_reach(points), axes=0)[0]
+
+    def _evaluated(
+        self, x: Array, inner: Array, at: Array, far: NDArray[np.bool_], *, axes: int
+    ) -> tuple[Array, Array]:
+        """Return values and gradients, (N, n, axes), at points of which some are taken within reach."""
         value = np.empty((len(x), self.function_count))
-        gradient = np.empty((len(x), self.function_count, 3))
+        gradient = np.empty((*value.shape, axes))
         for i in range(0, len(x), _CHUNK):
             some = slice(i, i + _CHUNK)
-            value[some], gradient[some] = self._evaluate_inside(inner[some], at[some])
+            raw, slopes = self.raw.evaluate(inner[some], at[some], gradients=axes > 0)
+            value[some] = raw @ self.transform
+            for d in range(axes):
+                gradient[some, :, d] = slopes[:, :, d] @ self.transform
         if far.any():
             # The functions' content of (X, Y, Z, 1): rows of the left inverse of the linear coordinates.
             content = np.linalg.solve(self.linear_coordinates.T @ self.linear_coordinates, self.linear_coordinates.T)
             value[far] += (x[far] - at[far]) @ content[:3]
-            gradient[far & (x != at).any(axis=1)] = content[:3].T
+            gradient[far & (x != at).any(axis=1)] = content[:3].T[:, :axes]
         return value, gradient
 
     def skinning_weights(self, points: ArrayLike) -> tuple[Array, Array]:
@@ -326,12 +351,6 @@ class ReducedBody:
         if self._envelope is not None and far.any():
             at = np.where((far & self._envelope.holds(x))[:, None], x, inner)
         return x, inner, at, far
-
-    def _evaluate_inside(self, x: Array, at: Array) -> tuple[Array, Array]:
-        """Evaluate functions (N, n) and gradients (N, n, 3) at points within reach; all but the kernels `at` others."""
-        raw, raw_gradient = self.raw.evaluate(x, at)
-        gradient = np.stack([raw_gradient[:, :, d] @ self.transform for d in range(3)], axis=2)
-        return raw @ self.transform, gradient
 
     def covers(self, points: ArrayLike) -> NDArray[np.bool_]:
         """Return which points (N, 3) the kernels reach, that is, which `evaluate` does not clamp."""

@@ -42,7 +42,8 @@ REACH = 0.35
 """How far from its nearest kernel centre a point may lie, as a fraction of the kernel's support. Inside an object the
 ratio stays under 0.3; beyond, the functions grow as extrapolated polynomials do (tenfold at 0.5), so they are held
 constant."""
-_PAIRS_PER_CHUNK = 2_000_000
+_PAIRS_PER_CHUNK = 125_000
+"""Distances that are looked at together: their tables stay in a processor's second cache."""
 _BLOCK_POINTS = 64
 
 
@@ -52,8 +53,8 @@ class ShapeFunctions:
 
     value: sparse.csr_matrix
     """phi~ (N, K)."""
-    gradient: tuple[sparse.csr_matrix, sparse.csr_matrix, sparse.csr_matrix]
-    """d phi~ / dX_d [1/m], three matrices (N, K) with the pattern of `value`."""
+    gradient: tuple[sparse.csr_matrix, ...]
+    """d phi~ / dX_d [1/m], three matrices (N, K) with the pattern of `value`; none where they were not asked for."""
 
     points: Array
     """Where they were evaluated [m], shape (N, 3)."""
@@ -72,7 +73,7 @@ class ShapeFunctions:
             return sparse.csr_matrix((data, self.value.indices, self.value.indptr), shape=self.value.shape)
 
         gradient = [like(g.data * factor[row] + self.value.data * slope[row, d]) for d, g in enumerate(self.gradient)]
-        return ShapeFunctions(like(self.value.data * factor[row]), (gradient[0], gradient[1], gradient[2]), self.points)
+        return ShapeFunctions(like(self.value.data * factor[row]), tuple(gradient), self.points)
 
     def blocks(self) -> list[tuple[NDArray[np.intp], NDArray[np.intp]]]:
         """Split the points into compact groups: rows of each, and the kernels that reach them, both ascending.
@@ -123,11 +124,12 @@ class BasisRKPM:
         """Support radii R_k [m], shape (K,)."""
         return self.radii * (CUBIC_SUPPORT if self.kernel == "cubic" else GAUSSIAN_SUPPORT)
 
-    def evaluate(self, points: ArrayLike) -> ShapeFunctions:
+    def evaluate(self, points: ArrayLike, *, gradients: bool = True) -> ShapeFunctions:
         """Evaluate all reproducing kernels and their gradients.
 
         Args:
             points: Rest positions [m], shape (N, 3).
+            gradients: Whether gradients are wanted; values alone take a third of the time.
 
         Returns:
             Sparse values (N, K) and gradients.
@@ -142,9 +144,9 @@ class BasisRKPM:
             raise BasisError("points: not all finite", hint="Remove the points that hold NaN or infinity.")
         if not len(x):
             empty = sparse.csr_matrix((0, self.kernel_count))
-            return ShapeFunctions(empty, (empty, empty, empty), x)
+            return ShapeFunctions(empty, (empty,) * (3 if gradients else 0), x)
         step = max(1, _PAIRS_PER_CHUNK // self.kernel_count)
-        parts = [self._evaluate_chunk(x[i : i + step], i) for i in range(0, len(x), step)]
+        parts = [self._evaluate_chunk(x[i : i + step], i, gradients) for i in range(0, len(x), step)]
         row_count = np.concatenate([p[0] for p in parts])
         column = np.concatenate([p[1] for p in parts])
         value, gradient = np.concatenate([p[2] for p in parts]), np.concatenate([p[3] for p in parts])
@@ -154,9 +156,7 @@ class BasisRKPM:
         def matrix(data: Array) -> sparse.csr_matrix:
             return sparse.csr_matrix((np.ascontiguousarray(data), column, start), shape=shape)
 
-        return ShapeFunctions(
-            matrix(value), (matrix(gradient[:, 0]), matrix(gradient[:, 1]), matrix(gradient[:, 2])), x
-        )
+        return ShapeFunctions(matrix(value), tuple(matrix(along) for along in gradient.T), x)
 
     def conditions(self, points: ArrayLike) -> Array:
         """Return the 1-norm condition numbers of the moment matrices at points (N, 3) [m], shape (N,).
@@ -167,13 +167,7 @@ class BasisRKPM:
         found = np.full(len(x), np.inf)
         step = max(1, _PAIRS_PER_CHUNK // self.kernel_count)
         for i in range(0, len(x), step):
-            row, column, count, longer = self._pairs(x[i : i + step])
-            offset = x[i : i + step][row] - self.centres[column]
-            poly = np.column_stack([np.ones(len(row)), offset / float(self.support.mean())])
-            bell, moment = self._bell(offset, column, longer)[0], np.empty((len(count), 4, 4))
-            for a, b in zip(*np.triu_indices(4), strict=True):
-                entry = np.bincount(row, poly[:, a] * poly[:, b] * bell, minlength=len(count))
-                moment[:, a, b] = moment[:, b, a] = entry
+            count, moment = self._moments(x[i : i + step])
             good = np.flatnonzero((count >= 4) & (moment[:, 0, 0] > 1e-14))
             scaled = moment[good] / moment[good, :1, :1]
             value = np.linalg.cond(scaled, 1)
@@ -207,14 +201,20 @@ class BasisRKPM:
         """Return at which of points (N, 3) `evaluate` finds enough kernels, shape (N,)."""
         found = np.zeros(len(points), dtype=bool)
         for some in np.array_split(np.arange(len(points)), 1 + len(points) * self.kernel_count // _PAIRS_PER_CHUNK):
-            row, column, count, longer = self._pairs(points[some])
-            offset = points[some[row]] - self.centres[column]
-            poly = np.column_stack([np.ones(len(row)), offset / float(self.support.mean())])
-            moment = np.zeros((len(some), 4, 4))
-            bell = self._bell(offset, column, longer)[0]
-            np.add.at(moment, row, bell[:, None, None] * poly[:, :, None] * poly[:, None])
+            count, moment = self._moments(points[some])
             found[some] = (count >= 4) & ~_inverted(moment)[1]
         return found
+
+    def _moments(self, x: Array) -> tuple[Indices, Array]:
+        """Return kernels per point (N,), and the moment matrices (N, 4, 4)."""
+        row, column, count, longer = self._pairs(x)
+        offset = x[row] - self.centres[column]
+        poly = np.column_stack([np.ones(len(row)), offset / float(self.support.mean())])
+        bell, moment = self._bell(offset, column, longer)[0], np.empty((len(x), 4, 4))
+        for a, b in zip(*np.triu_indices(4), strict=True):
+            entry = np.bincount(row, poly[:, a] * poly[:, b] * bell, minlength=len(x))
+            moment[:, a, b] = moment[:, b, a] = entry
+        return count, moment
 
     @cached_property
     def _tree(self) -> KDTree:
@@ -244,9 +244,11 @@ class BasisRKPM:
             longer = along[0], np.stack(along[1:], axis=1) if slopes else np.zeros((1, 1))
         return row, column, np.bincount(row, minlength=len(x)), longer
 
-    def _evaluate_chunk(self, x: Array, first: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array]:
-        """Return kernels per point (N,), column of each pair, value (pairs,) and gradient (pairs, 3)."""
-        row, column, count, longer = self._pairs(x, slopes=True)
+    def _evaluate_chunk(
+        self, x: Array, first: int, gradients: bool
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array]:
+        """Return kernels per point (N,), column of each pair, value (pairs,) and gradient (pairs, 3) or (pairs, 0)."""
+        row, column, count, longer = self._pairs(x, slopes=gradients)
         if count.min() < 4:
             self._raise_uncovered(np.flatnonzero(count < 4) + first, x[count < 4])
         h = float(self.support.mean())
@@ -267,6 +269,8 @@ class BasisRKPM:
         c = inverse[:, :, 0]
         s = np.einsum("pi,pi->p", poly, np.take(c, row, axis=0))
         value = w * s
+        if not gradients:
+            return count, column, value, np.empty((len(value), 0))
         # dM_d c = sum_k (d_d w) s P + e_(d+1)/h + M[:, 0] c_(d+1)/h   (because sum_k w s P = M c = e_0);   dc_d =
         # -M^-1 dM_d c.
         slope_s = slope * s[:, None]

@@ -66,13 +66,16 @@ class SkinningWeights:
         return self.degrees[self.owner] == 0
 
     def evaluate(self, shape: ShapeFunctions, blend: Array, blend_gradient: Array) -> tuple[Array, Array]:
-        """Return the weights (N, J) and their gradients [1/m] (N, J, 3) from enveloped kernels and blends."""
+        """Return the weights (N, J) and, where kernels have gradients, theirs [1/m] (N, J, 3)."""
         value = shape.value @ self.coefficients
-        gradient = np.stack([g @ self.coefficients for g in shape.gradient], axis=2)
+        axes = len(shape.gradient)
+        gradient = np.empty((*value.shape, axes))
+        for d, along in enumerate(shape.gradient):
+            gradient[:, :, d] = along @ self.coefficients
         value[:, 0], gradient[:, 0] = 1.0, 0.0  # Exact, so that affine motion is; the kernels give it to rounding only.
         for weight in np.flatnonzero(self.blends >= 0):
             value[:, weight] += blend[:, self.blends[weight]]
-            gradient[:, weight] += blend_gradient[:, self.blends[weight]]
+            gradient[:, weight] += blend_gradient[:, self.blends[weight], :axes]
         return value, gradient
 
     def products(self, value: Array, gradient: Array, points: Array, length: float) -> tuple[Array, Array]:
@@ -87,8 +90,8 @@ class SkinningWeights:
             slope[:, 4 + k, b] += z[:, a] / length
         owner, monomial = self.owner, self.monomial
         weight, factor = value[:, owner], z[:, monomial]
-        found = np.empty((3, count, len(owner)))  # Axis by axis: these are the largest arrays of a build.
-        for d in range(3):
+        found = np.empty((gradient.shape[2], count, len(owner)))  # Axis by axis: the largest arrays of a build.
+        for d in range(len(found)):
             np.multiply(gradient[:, owner, d], factor, out=found[d])
             sloping = np.flatnonzero(np.any(slope[:, :, d], axis=0)[monomial])
             found[d][:, sloping] += weight[:, sloping] * slope[:, monomial[sloping], d]

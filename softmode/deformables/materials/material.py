@@ -39,6 +39,8 @@ damping beta K in a form that does not see rotations: with beta = ``viscosity`` 
 angular frequency omega of the body at rest has the damping ratio zeta = alpha / (2 omega) + beta omega / 2.
 """
 
+import math
+import warnings
 from dataclasses import dataclass
 
 from softmode.checks import require_fields, require_number
@@ -79,3 +81,25 @@ class Material:
         rates = ("viscosity", "mass_damping", "friction")
         require_fields(self, rates, at_least=0.0, hint="use 0 to switch it off", error=MaterialError)
         require_models([self.model])
+
+
+_USUAL = {
+    "youngs_modulus": (1.0e2, 1.0e11, "Pa", 1.0e6, {"kPa": 1.0e3, "MPa": 1.0e6, "GPa": 1.0e9, "dyn/cm^2": 0.1}),
+    "density": (5.0, 3.0e4, "kg/m^3", 1.0e3, {"g/cm^3": 1.0e3, "kg/mm^3": 1.0e9, "t/mm^3": 1.0e12, "g/m^3": 1.0e-3}),
+}
+"""Least and largest usual value, unit and typical value of a property, and how many units others are."""
+
+
+def warn_of_units(material: Material, name: str) -> None:
+    """Warn if Young's modulus or density is that of no solid, with the unit that it was likely meant in.
+
+    Args:
+        material: What something is made of.
+        name: That something.
+    """
+    for field, (low, high, unit, typical, others) in _USUAL.items():
+        value = getattr(material, field)
+        if not low <= value <= high:
+            likely = min(others, key=lambda other: abs(math.log10(value * others[other] / typical)))
+            told = f"{name}: {field} is {value:g} {unit}, outside {low:g}..{high:g}"
+            warnings.warn(f"{told}; if it is in {likely}, give {value * others[likely]:g}", stacklevel=3)

@@ -63,7 +63,7 @@ SMALL_TEAM = 96
 LARGE_TEAM = 256
 """where every world has a multiprocessor to itself,"""
 TEAM = 128
-"""and elsewhere. All are measured, see ``docs/performance.md``."""
+"""and elsewhere. All are measured, see ``benchmarks/JOURNAL.md``."""
 TAIL_TEAM = 192
 """Threads that share a world of few points where rounds of launches take most worlds to their end."""
 FEW_POINTS = 128

@@ -54,7 +54,7 @@ BLOCK = 128
 
 TEAMS = 672
 """Threads of teams that a multiprocessor takes at a time: what registers are given out for. All measured, see
-``docs/performance.md``."""
+``benchmarks/JOURNAL.md``."""
 ALWAYS = 5
 """Rounds that are taken however few worlds are left."""
 BESIDE = 2

@@ -50,7 +50,7 @@ CUDA_THREADS = 2**16
 ONE_LAUNCH_BLOCKS = 7
 """Blocks of eight functions up to which a body is small enough for a team of threads on CUDA; on CPU any is."""
 ROUNDS = 10
-"""Most rounds of launches before the one launch where worlds are many: measured, see ``docs/performance.md``.
+"""Most rounds of launches before the one launch where worlds are many: measured, see ``benchmarks/JOURNAL.md``.
 
 The one launch alone loses 16 and 9 % of the steps (plush, grasps and random actions of 4,096 worlds on one H200), 10
 and 7 % (beam)."""

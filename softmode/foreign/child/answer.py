@@ -39,8 +39,9 @@ def load(request: dict[str, Any]) -> None:
     if request["library"] == "pxr":
         modules = ["Sdf", "Usd", "UsdGeom"]
         if request["what"] in ("scene", "asset", "robot"):
-            modules += ["UsdPhysics", "UsdShade"]
-            importlib.import_module("numpy")
+            modules += ["Ar", "UsdPhysics", "UsdShade"]
+            for name in ("numpy", "PIL.Image"):
+                importlib.import_module(name)
         for module in modules:
             importlib.import_module(f"pxr.{module}")
     for module in ("pyarrow.parquet", "pyarrow.ipc") if request["library"] == "pyarrow" else (request["library"],):
@@ -58,7 +59,7 @@ def answer(request: dict[str, Any]) -> int:
         source = open_stage(path, request["root"], budget, request["strict"]) if stages else budget
         arrays = Arrays()
         reader = importlib.import_module(f".{request['what']}", __package__)
-        described = reader.read(source, request, arrays)
+        described = reader.read(source, request | {"budget": budget}, arrays)
         described["arrays"] = arrays.described
         with open(request["answer"], "wb") as out:
             out.write(json.dumps(described).encode("ascii") + b"\n")

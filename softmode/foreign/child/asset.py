@@ -7,9 +7,12 @@ from typing import Any
 from .. import tokens
 from ..openusd import Stage, pxr
 from .answer import Arrays, prims_of
+from .appearance import Pictures
 from .deformables import visible
+from .instancers import expand
 from .scene import geometry_of
 from .splats import flat
+from .unread import other_units, unread
 
 
 def read(stage: Stage, request: dict[str, Any], arrays: Arrays) -> dict[str, Any]:
@@ -21,6 +24,7 @@ def read(stage: Stage, request: dict[str, Any], arrays: Arrays) -> dict[str, Any
         arrays: Takes the arrays.
     """
     Usd, UsdGeom, UsdPhysics = pxr("Usd", "UsdGeom", "UsdPhysics")
+    copies = expand(stage)
     time = Usd.TimeCode.EarliestTime()
     transforms = UsdGeom.XformCache(time)
     prims = list(prims_of(stage))
@@ -30,11 +34,12 @@ def read(stage: Stage, request: dict[str, Any], arrays: Arrays) -> dict[str, Any
         for prim in prims
         if prim.GetTypeName() == tokens.MESH and visible(prim) and UsdGeom.Imageable(prim).ComputePurpose() in shown
     ] or [prim for prim in prims if prim.GetTypeName() == tokens.TET_MESH]
+    pictures = Pictures(arrays, request["budget"])
     sent = [
         {
             "kind": str(prim.GetTypeName()),
             "matrix": flat(transforms.GetLocalToWorldTransform(prim)),
-            **geometry_of(prim, time, arrays),
+            **geometry_of(prim, time, arrays, pictures),
         }
         for prim in (meshes if request["geometry"] else ())
     ]
@@ -43,6 +48,8 @@ def read(stage: Stage, request: dict[str, Any], arrays: Arrays) -> dict[str, Any
         "meters": UsdGeom.GetStageMetersPerUnit(stage),
         "kilograms": UsdPhysics.GetStageKilogramsPerUnit(stage),
         "meshes": sent,
+        "warnings": other_units(stage, prims),
+        "notes": [*copies, *unread(prims, [str(prim.GetPath()) for prim in meshes])],
         "splat_count": sum(prim.GetTypeName() == tokens.SPLATS and visible(prim) for prim in prims),
         "body_count": sum(bool(prim.GetAttribute(tokens.FORMAT)) for prim in prims),
     }

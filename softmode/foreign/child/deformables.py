@@ -230,10 +230,9 @@ def _body(root: Prim, roots: set[Value]) -> Body | None:
     body = Body(root, geometry)
     body.splats = [p for p in of_type[tokens.SPLATS] if visible(p) or p == geometry]
     body.meshes = [p for p in of_type[tokens.MESH] if p != geometry and visible(p)]
+    if any(one.GetName().endswith(":kinematicEnabled") and one.Get() is True for one in root.GetAuthoredAttributes()):
+        body.notes.append("is kinematic in the stage; softmode simulates it: hold it by a region, or make it rigid")
     for namespace in ("physics", "omniphysics"):
-        kinematic = root.GetAttribute(f"{namespace}:kinematicEnabled")
-        if kinematic and kinematic.Get() is True:
-            body.notes.append("is kinematic in the stage; softmode simulates it")
         rest = geometry.GetAttribute(f"{namespace}:restShapePoints")
         if rest and rest.HasAuthoredValue():
             body.notes.append("starts undeformed, in its rest shape")

@@ -25,7 +25,7 @@ def read(budget: Budget, request: dict[str, Any], arrays: Arrays) -> dict[str, A
     Args:
         budget: Allowed for each file that the file refers to.
         request: `want`: "colors" for the arrays of a coloured mesh, "surface" for one mesh in the unit and the axes of
-            robots (metres, as they are), "points" for points and their colours.
+            robots (metres, as they are).
         arrays: Takes the arrays.
     """
     path, want = request["file"], request["want"]
@@ -36,21 +36,17 @@ def read(budget: Budget, request: dict[str, Any], arrays: Arrays) -> dict[str, A
         raise Refused(f"unknown kind {'.' + kind if kind else '(no suffix)'!r}", hint)
     resolver = _Resolver(path, request["root"], budget)
     with open(path, "rb") as file:
-        load: Any = trimesh.load if want == "points" else trimesh.load_scene
-        loaded = load(file, file_type=kind, resolver=resolver)
+        loaded = trimesh.load_scene(file, file_type=kind, resolver=resolver)
     if resolver.refused:
         raise resolver.refused
     if want == "colors":
         found = gathered(loaded, spent=True)
-        numbers = {"textures": [arrays.add(picture) for picture in found.pop("textures")]}
+        numbers: dict[str, Any] = {"textures": [arrays.add(picture) for picture in found.pop("textures")]}
+        numbers["offset"] = found.pop("offset")
         return numbers | {name: arrays.add(np.ascontiguousarray(value)) for name, value in found.items()}
-    mesh = loaded.to_mesh() if want == "surface" else loaded
-    sent: list[Any] = [np.ascontiguousarray(mesh.vertices, np.float64)]
-    if want == "surface":
-        sent.append(np.ascontiguousarray(mesh.faces, np.int64))
-        sent[0] *= _collada_unit(path) if kind == "dae" else 1.0
-    elif len(getattr(mesh, "colors", ())) == len(sent[0]):
-        sent.append(np.ascontiguousarray(mesh.colors[:, :3]))
+    mesh = loaded.to_mesh()
+    sent: list[Any] = [np.ascontiguousarray(mesh.vertices, np.float64), np.ascontiguousarray(mesh.faces, np.int64)]
+    sent[0] *= _collada_unit(path) if kind == "dae" else 1.0
     return {"sent": [arrays.add(array) for array in sent]}
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from ..openusd import Prim, Stage, pxr
@@ -34,8 +35,24 @@ def read(stage: Stage, request: dict[str, Any], arrays: Arrays) -> dict[str, Any
         "tendons": [_tendon(prim) for prim in prims if prim.GetTypeName() == "MjcTendon"],
         "accelerations": [str(prim.GetPath()) for prim in prims if _by_acceleration(prim)],
         "articulations": sum(prim.HasAPI(UsdPhysics.ArticulationRootAPI) for prim in prims),
+        "mimics": [found for prim in prims for found in _mimics(prim, meters)],
+        "kinematic": [str(prim.GetPath()) for prim in prims if prim.GetAttribute("physics:kinematicEnabled").Get()],
         "deformables": [*paths, *(str(one.path) for one in left)],
     }
+
+
+def _mimics(prim: Prim, meters: float) -> list[dict[str, Any]]:
+    """Return the joints that one follows, and of PhysX's schema what it adds to the coordinate [rad or m]."""
+    found = []
+    for schema in map(str, prim.GetPrimTypeInfo().GetAppliedAPISchemas()):
+        kind, _, axis = schema.partition(":")
+        name = {"NewtonMimicAPI": "newton:mimicJoint", "PhysxMimicJointAPI": f"physxMimicJoint:{axis}:referenceJoint"}
+        if kind in name:
+            targets = [str(path) for path in prim.GetRelationship(name[kind]).GetTargets()]
+            added = float(prim.GetAttribute(f"physxMimicJoint:{axis}:offset").Get() or 0.0) if axis else 0.0
+            added *= math.pi / 180.0 if axis.startswith("rot") else meters
+            found.append({"path": str(prim.GetPath()), "leader": targets, "offset": -added if axis else None})
+    return found
 
 
 def _by_acceleration(prim: Prim) -> bool:

@@ -8,9 +8,12 @@ from typing import Any
 from .. import tokens
 from ..openusd import Prim, Stage, Value, pxr
 from .answer import Arrays, prims_of
+from .appearance import Pictures, look_of
 from .deformables import applied, find_bodies, find_ties, uninstance, visible
+from .instancers import expand
 from .limits import Refused
 from .splats import flat, read_prim
+from .unread import other_units, unread
 
 
 def read(stage: Stage, request: dict[str, Any], arrays: Arrays) -> dict[str, Any]:
@@ -24,6 +27,7 @@ def read(stage: Stage, request: dict[str, Any], arrays: Arrays) -> dict[str, Any
     """
     Usd, UsdGeom, UsdPhysics = pxr("Usd", "UsdGeom", "UsdPhysics")
     meters, kilograms = UsdGeom.GetStageMetersPerUnit(stage), UsdPhysics.GetStageKilogramsPerUnit(stage)
+    copies = expand(stage)
     uninstance(stage, every=request["copy"] is not None and (meters != 1.0 or kilograms != 1.0))
     prims = list(prims_of(stage))
     time = Usd.TimeCode.EarliestTime()
@@ -32,7 +36,7 @@ def read(stage: Stage, request: dict[str, Any], arrays: Arrays) -> dict[str, Any
     ignored = find_ties(prims, left)
     described = []
     used: list[str] = []
-    most = request["most"]
+    most, pictures = request["most"], Pictures(arrays, request["budget"])
 
     def read_splats(prim: Prim) -> dict[str, Any]:
         nonlocal most
@@ -50,9 +54,12 @@ def read(stage: Stage, request: dict[str, Any], arrays: Arrays) -> dict[str, Any
                 "surface": any(name in tokens.SURFACE_SIM_APIS for name in applied(geometry)),
                 "matrix": flat(transforms.GetLocalToWorldTransform(geometry)),
                 "body_matrix": flat(transforms.GetLocalToWorldTransform(body.prim)),
-                "shape": geometry_of(geometry, time, arrays),
+                "shape": geometry_of(geometry, time, arrays, pictures),
                 "meshes": [
-                    {"matrix": flat(transforms.GetLocalToWorldTransform(mesh)), **geometry_of(mesh, time, arrays)}
+                    {
+                        "matrix": flat(transforms.GetLocalToWorldTransform(mesh)),
+                        **geometry_of(mesh, time, arrays, pictures),
+                    }
                     for mesh in body.meshes
                 ],
                 "splats": [read_splats(prim) for prim in body.splats],
@@ -64,6 +71,9 @@ def read(stage: Stage, request: dict[str, Any], arrays: Arrays) -> dict[str, Any
             }
         )
         used += [str(prim.GetPath()) for prim in (geometry, *body.splats, *body.meshes)]
+        beneath = [prim for prim in prims if prim.GetPath().HasPrefix(body.prim.GetPath())]
+        described[-1]["notes"] += unread(beneath, used)
+    kinematic = [f"{body.prim.GetPath()}: {note}" for body in bodies for note in body.notes if "kinematic" in note]
     if request["copy"] is not None:
         copy = importlib.import_module(".copy", __package__)
         copy.write_rest(stage, prims, request["copy"], used, [str(body.prim.GetPath()) for body in bodies], ignored)
@@ -77,29 +87,22 @@ def read(stage: Stage, request: dict[str, Any], arrays: Arrays) -> dict[str, Any
             for prim in prims
             if prim.GetTypeName() == tokens.SPLATS and str(prim.GetPath()) not in used and visible(prim)
         ],
+        "warnings": other_units(stage, prims) + kinematic,
         "notes": [
             *(f"{one.path}: {one.reason}; left to Newton's importer" for one in left),
             *(f"{path}: {kind} between deformables is not read" for path, kind in ignored),
-            *_other_units(stage),
+            *copies,
+            *unread([prim for prim in prims if prim.GetTypeName() not in _NEWTON], used),
         ],
     }
 
 
-def _other_units(stage: Stage) -> list[str]:
-    """Return a note for each layer whose unit or axis is not the stage's: OpenUSD takes its numbers as they are."""
-    (UsdGeom,) = pxr("UsdGeom")
-    expected = {"metersPerUnit": UsdGeom.GetStageMetersPerUnit(stage), "upAxis": UsdGeom.GetStageUpAxis(stage)}
-    notes = []
-    for layer in stage.GetUsedLayers():
-        for name, value in expected.items():
-            given = layer.pseudoRoot.GetInfo(name) if layer.pseudoRoot.HasInfo(name) else value
-            if given != value:
-                notes.append(f"{layer.GetDisplayName()}: {name} {given}, the stage's is {value}; nothing converts it")
-    return notes
+_NEWTON = ("Capsule", "Cone", "Cube", "Cylinder", "Mesh", "Plane", "Points", "Sphere", tokens.SPLATS, tokens.TET_MESH)
+"""Types of geometry that Newton's importer or softmode itself reads where it belongs to no body of softmode."""
 
 
-def geometry_of(prim: Prim, time: Value, arrays: Arrays) -> dict[str, Any]:
-    """Return the numbers of the arrays of a Mesh, TetMesh or Points prim, by attribute."""
+def geometry_of(prim: Prim, time: Value, arrays: Arrays, pictures: Pictures) -> dict[str, Any]:
+    """Return the numbers of the arrays of a Mesh, TetMesh or Points prim, by attribute, and its `look`."""
     found: dict[str, Any] = {"path": str(prim.GetPath())}
     names = {
         "points": ("physics:restShapePoints", "omniphysics:restShapePoints", "points"),
@@ -108,7 +111,6 @@ def geometry_of(prim: Prim, time: Value, arrays: Arrays) -> dict[str, Any]:
         "tets": ("tetVertexIndices",),
         "widths": ("widths",),
         "masses": (tokens.MASSES, "omniphysics:masses"),
-        "colors": ("primvars:displayColor",),
     }
     for name, candidates in names.items():
         for candidate in candidates:
@@ -119,6 +121,8 @@ def geometry_of(prim: Prim, time: Value, arrays: Arrays) -> dict[str, Any]:
                 break
     orientation = prim.GetAttribute("orientation")
     found["left_handed"] = bool(orientation) and orientation.Get(time) == "leftHanded"
+    if prim.GetTypeName() != tokens.POINTS:
+        found["look"] = look_of(prim, time, arrays, pictures)
     return found
 
 

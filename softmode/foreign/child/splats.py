@@ -6,6 +6,8 @@ from typing import Any
 
 from ..openusd import Prim, Stage, Value, pxr
 from .answer import Arrays, prims_of
+from .instancers import expand
+from .unread import other_units, unread
 
 _ARRAYS = ("positions", "orientations", "scales", "opacities", "radiance:sphericalHarmonicsCoefficients")
 
@@ -21,6 +23,7 @@ def read(stage: Stage, request: dict[str, Any], arrays: Arrays) -> dict[str, Any
     Usd, UsdGeom = pxr("Usd", "UsdGeom")
     code = request["time"]
     time = Usd.TimeCode.EarliestTime() if code is None else Usd.TimeCode(code)
+    copies = expand(stage)
     transforms = UsdGeom.XformCache(time)
     prims: list[dict[str, Any]] = []
     total = 0
@@ -32,7 +35,14 @@ def read(stage: Stage, request: dict[str, Any], arrays: Arrays) -> dict[str, Any
         found, count = read_prim(prim, time, arrays, request["most"] - total)
         total += count
         prims.append({**found, "matrix": flat(transforms.GetLocalToWorldTransform(prim))})
-    return {"up": str(UsdGeom.GetStageUpAxis(stage)), "meters": UsdGeom.GetStageMetersPerUnit(stage), "prims": prims}
+    everything = list(prims_of(stage))
+    return {
+        "up": str(UsdGeom.GetStageUpAxis(stage)),
+        "meters": UsdGeom.GetStageMetersPerUnit(stage),
+        "prims": prims,
+        "warnings": other_units(stage, everything),
+        "notes": [*copies, *unread(everything, [prim["path"] for prim in prims])],
+    }
 
 
 def read_prim(prim: Prim, time: Value, arrays: Arrays, most: int) -> tuple[dict[str, Any], int]:

@@ -13,11 +13,25 @@ GREY = 0.6
 """Colour of a mesh that names none; gamma-encoded."""
 MAX_TEXELS = 2**26
 """Most pixels of all textures of a mesh or scene."""
+FAR = 100.0
+"""Coordinates farther out than so many extents are centred before they become float32."""
 _AGAIN = "Export the mesh again"
 
 
+def near_zero(points: NDArray[Any]) -> tuple[NDArray[Any], tuple[float, float, float]]:
+    """Return points (N, 3) and an offset [m] that leaves them to float32: none unless they lie `FAR` extents away."""
+    few = np.asarray(points[:: max(1, len(points) // 10_000)], dtype=np.float64)
+    low, high = np.quantile(few, [0.01, 0.99], axis=0) if len(few) > 3 else np.zeros((2, 3))
+    extent = float((high - low).max())
+    if not 0.0 < FAR * extent < np.abs([low, high]).max():
+        return points, (0.0, 0.0, 0.0)
+    step = 10.0 ** np.ceil(np.log10(extent))
+    x, y, z = (step * np.round(0.5 * (low + high) / step)).tolist()
+    return points.astype(np.float64) - (x, y, z), (x, y, z)
+
+
 def gathered(source: Any, *, spent: bool = False) -> dict[str, Any]:
-    """Return the arrays of a `softmode.splats.ColoredMesh` by name, with `textures`, the list of its pictures.
+    """Return the fields of a `softmode.splats.ColoredMesh` by name: arrays, `textures` (its pictures), and `offset`.
 
     Args:
         source: A `trimesh.Trimesh` or `trimesh.Scene`.
@@ -45,15 +59,18 @@ def gathered(source: Any, *, spent: bool = False) -> dict[str, Any]:
         if image is not None:
             chosen = known.setdefault(id(image), len(textures))
             if chosen == len(textures):
-                textures.append(_pixels(image, MAX_TEXELS - sum(texture.size // 3 for texture in textures)))
+                textures.append(decoded(image, MAX_TEXELS - sum(texture.size // 3 for texture in textures)))
                 if spent:
                     image.close()
-        found.append((placed.astype(np.float32)[faces], color, uv, np.full(len(faces), chosen, np.int32)))
+        found.append((placed[faces], color, uv, np.full(len(faces), chosen, np.int32)))
     if not found:
         raise Refused("holds no triangles", "Export a triangle mesh, not points or curves")
     names = ("corners", "corner_colors", "corner_uvs", "texture_index")
     columns = (values[0] if len(values) == 1 else np.concatenate(values) for values in zip(*found, strict=True))
-    return {**dict(zip(names, columns, strict=True)), "textures": tuple(textures)}
+    fields: dict[str, Any] = dict(zip(names, columns, strict=True))
+    corners, offset = near_zero(fields["corners"].reshape(-1, 3))
+    fields["corners"] = corners.astype(np.float32).reshape(-1, 3, 3)
+    return {**fields, "textures": tuple(textures), "offset": offset}
 
 
 def _appearance(mesh: Any) -> tuple[NDArray[np.float32], NDArray[np.float32], Any]:
@@ -105,7 +122,7 @@ def _gamma_encoded(linear: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055)
 
 
-def _pixels(image: Any, left: int) -> NDArray[np.uint8]:
+def decoded(image: Any, left: int) -> NDArray[np.uint8]:
     """Decode an image of at most so many pixels."""
     if image.width * image.height > left:
         text = f"a texture of {image.width} x {image.height} px, with the others more than {MAX_TEXELS} px"

@@ -17,6 +17,7 @@ from typing import Literal
 from softmode.errors import ConfigError
 from softmode.splats.formats.common import typed_errors, unreadable
 from softmode.splats.formats.compressed_ply import write_compressed_ply
+from softmode.splats.formats.others import refuse_others
 from softmode.splats.formats.ply import read_ply, write_ply
 from softmode.splats.formats.sog import read_sog
 from softmode.splats.formats.splat import read_splat, write_splat
@@ -92,6 +93,7 @@ def read_splats(path: str | os.PathLike[str]) -> Splats:
             raise unreadable(file, "no such file", hint="Check the path")
         reader = _READERS.get(file.suffix.lower())
         if reader is None:
+            refuse_others(file)
             raise unreadable(
                 file,
                 f"unknown kind {file.suffix.lower() or '(no suffix)'!r}",

@@ -10,6 +10,7 @@ Reference:
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from softmode.splats.formats.common import (
     quats_from_smallest_three,
     sh_from_colors,
     smallest_three_from_quats,
+    sound_splats,
     to_unsigned,
     unreadable,
 )
@@ -33,7 +35,9 @@ _COLOR_BOUNDS = [f"{side}_{channel}" for side in ("min", "max") for channel in "
 _PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
 
 
-def decode_compressed(chunk: NDArray[Any], vertex: NDArray[Any], sh: NDArray[Any] | None, path: str) -> Splats:
+def decode_compressed(
+    chunk: NDArray[Any], vertex: NDArray[Any], sh: NDArray[Any] | None, path: str, notes: Sequence[str] = ()
+) -> Splats:
     """Decode the tables of a compressed `.ply`.
 
     Args:
@@ -41,6 +45,7 @@ def decode_compressed(chunk: NDArray[Any], vertex: NDArray[Any], sh: NDArray[Any
         vertex: Four packed integers per splat.
         sh: 9, 24 or 45 coefficients per splat as bytes, channel-major; None for degree 0.
         path: Name of the file, for messages.
+        notes: What is to be said of the file.
 
     Raises:
         AssetError: If the tables do not belong together or hold no usable splats.
@@ -74,13 +79,14 @@ def decode_compressed(chunk: NDArray[Any], vertex: NDArray[Any], sh: NDArray[Any
         for k, name in enumerate(names):
             channel, order = divmod(k, len(names) // 3)
             coefficients[:, 1 + order, channel] = _SH_CODES[sh[name]]
-    return Splats(
+    return sound_splats(
+        f"splat file {path}",
         means=within(_BOUNDS, _fields(vertex["packed_position"], (21, 11), (11, 10), (0, 11))),
         quats=wxyz[:, [1, 2, 3, 0]],
         scales=exp_scales(within(_SCALE_BOUNDS, _fields(vertex["packed_scale"], (21, 11), (11, 10), (0, 11)))),
         opacities=color[:, 3],
         sh=coefficients,
-        name=f"splat file {path}",
+        notes=notes,
     )
 
 

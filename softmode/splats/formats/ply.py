@@ -7,8 +7,6 @@ Reference:
 from __future__ import annotations
 
 import os
-import re
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,148 +14,129 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softmode.files import open_file, whole_file
-from softmode.splats.formats.common import check_count, exp_scales, read_exactly, sigmoid, unreadable
+from softmode.splats.formats.common import (
+    REEXPORT,
+    exp_scales,
+    sh_from_colors,
+    sigmoid,
+    sound_splats,
+    unit_colors,
+    unreadable,
+)
 from softmode.splats.formats.compressed_ply import decode_compressed
+from softmode.splats.formats.ply_table import check_rows, read_header, read_tables
 from softmode.splats.splats import Splats
 
-_HEADER_LIMIT = 64 * 1024
-
-_PLY_TYPES = {
-    **dict.fromkeys(("char", "int8"), "i1"),
-    **dict.fromkeys(("uchar", "uint8"), "u1"),
-    **dict.fromkeys(("short", "int16"), "<i2"),
-    **dict.fromkeys(("ushort", "uint16"), "<u2"),
-    **dict.fromkeys(("int", "int32"), "<i4"),
-    **dict.fromkeys(("uint", "uint32"), "<u4"),
-    **dict.fromkeys(("float", "float32"), "<f4"),
-    **dict.fromkeys(("double", "float64"), "<f8"),
-}
-_PLY_COLUMNS = "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 rot_0 rot_1 rot_2 rot_3".split()
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Element:
-    """One element of a PLY header: a table of `count` rows."""
-
-    name: str
-    count: int
-    properties: list[tuple[str, str]]
-
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        return np.dtype(self.properties)
-
-    @property
-    def size(self) -> int:
-        return self.count * self.dtype.itemsize
+COLORS = tuple(
+    tuple(f"{prefix}{channel}" for channel in channels)
+    for prefix, channels in (
+        ("", ("red", "green", "blue")),
+        ("diffuse_", ("red", "green", "blue")),
+        ("", ("r", "g", "b")),
+    )
+)
+"""Names of colours, in the order in which they are looked for."""
+_KNOWN = ("x", "y", "z", "nx", "ny", "nz", "opacity", "filter_3D", *(n for names in COLORS for n in names), "alpha")
+_FAMILIES = ("f_dc_", "f_rest_", "scale_", "rot_")
 
 
 def read_ply(path: str | os.PathLike[str]) -> Splats:
     """Read an INRIA `.ply` (log scales, logit opacities, quaternions wxyz) or a PlayCanvas `.compressed.ply`.
 
-    Disc splats with two scales (2D Gaussian splatting) get a third one, a thousandth of the smaller.
+    Text and both byte orders are read. What has scales and rotations is splats; colours are those of degree 0, else
+    red, green and blue, as integers or floats. Discs with two scales (2D Gaussian splatting) get a third one, a
+    thousandth of the smaller; the filter of Mip-Splatting, `filter_3D`, is applied. Other elements and properties are
+    left out.
 
     Raises:
         AssetError: If the file is no splat `.ply`, contradicts its header, or holds no usable splats.
     """
     file_path = Path(path)
     with open_file(file_path, "splat file") as file:
-        elements, offset = _parse_header(file.read(_HEADER_LIMIT), str(file_path))
-        names = [element.name for element in elements]
-        if names not in (["vertex"], ["chunk", "vertex"], ["chunk", "vertex", "sh"]):
-            raise unreadable(
-                file_path,
-                f"elements {names[:8]}, expected 'vertex', or 'chunk', 'vertex' and 'sh'",
-                hint="Only splat .ply files can be read; sample a mesh with `softmode splat from-mesh`",
-            )
-        vertex = elements[names.index("vertex")]
-        check_count(vertex.count, str(file_path))
-        if len(elements) == 1:
-            _check_columns(vertex, str(file_path))
-        declared, size = offset + sum(element.size for element in elements), os.fstat(file.fileno()).st_size
-        if size != declared:
-            raise unreadable(
-                file_path, f"header declares {vertex.count} splats and {declared} bytes, the file holds {size}"
-            )
-        file.seek(offset)
-        tables = {
-            element.name: np.frombuffer(read_exactly(file, element.size, file_path), dtype=element.dtype)
-            for element in elements
-        }
-    if len(elements) > 1:
-        return decode_compressed(tables["chunk"], tables["vertex"], tables.get("sh"), str(file_path))
-    return _decode(tables["vertex"], str(file_path))
+        header = read_header(file, str(file_path))
+        compressed = "chunk" in header.elements
+        names = {name for name, _ in check_rows(header, "vertex", file_path).properties}
+        if not compressed:
+            _check_columns(names, str(file_path))
+        used = ("chunk", "vertex", "sh") if compressed else ("vertex",)
+        tables = read_tables(file, header, used, file_path)
+    notes = header.unread(used)
+    if compressed:
+        return decode_compressed(tables["chunk"], tables["vertex"], tables.get("sh"), str(file_path), notes)
+    return _decode(tables["vertex"], str(file_path), notes)
 
 
-def _decode(table: NDArray[Any], path: str) -> Splats:
+def columns_of(table: NDArray[Any], names: tuple[str, ...]) -> NDArray[Any]:
+    """Return columns side by side, shape (N, len(names)), of the type that holds all of them."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.stack([table[name] for name in names], axis=1)
+
+
+def colors_of(table: NDArray[Any]) -> tuple[NDArray[np.float64] | None, str]:
+    """Return the colours 0..1 of a table, shape (N, 3), None where it has none, and what to say of them."""
+    found = next((names for names in COLORS if set(names) <= set(table.dtype.names or ())), None)
+    return (None, "") if found is None else unit_colors(columns_of(table, found))
+
+
+def _decode(table: NDArray[Any], path: str, notes: list[str]) -> Splats:
     """Decode the vertex table of an INRIA `.ply`; f_rest is channel-major."""
-
-    def columns(*names: str) -> NDArray[np.float32]:
-        with np.errstate(over="ignore", invalid="ignore"):
-            return np.stack([table[name] for name in names], axis=1).astype(np.float32)
-
     names = table.dtype.names or ()
-    rest_count = sum(name.startswith("f_rest_") for name in names)
-    sh = columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None]
-    if rest_count:
-        rest = columns(*(f"f_rest_{i}" for i in range(rest_count)))
-        sh = np.concatenate([sh, rest.reshape(len(table), 3, -1).transpose(0, 2, 1)], axis=1)
-    scales = exp_scales(columns(*(name for name in ("scale_0", "scale_1", "scale_2") if name in names)))
-    if scales.shape[1] == 2:  # 2D Gaussian splatting stores discs; a thousandth keeps them solid and invertible
-        scales = np.concatenate([scales, 1e-3 * scales.min(axis=1, keepdims=True)], axis=1)
-    return Splats(
-        means=columns("x", "y", "z"),
-        quats=columns("rot_1", "rot_2", "rot_3", "rot_0"),
+
+    def family(prefix: str) -> NDArray[Any]:
+        return columns_of(table, tuple(f"{prefix}{i}" for i in range(sum(name.startswith(prefix) for name in names))))
+
+    if "f_dc_0" in names:
+        sh = family("f_dc_").astype(np.float32)[:, None]
+    else:
+        colors, said = colors_of(table)
+        if colors is None:
+            colors, said = np.full((len(table), 3), 0.5), "has no colours: grey"
+        notes += [said] if said else []
+        sh = sh_from_colors(colors).astype(np.float32)
+    if "f_rest_0" in names:
+        rest = family("f_rest_").astype(np.float32).reshape(len(table), 3, -1).transpose(0, 2, 1)
+        sh = np.concatenate([sh, rest[:, :24]], axis=1)
+    with np.errstate(over="ignore", invalid="ignore"):
+        scales = exp_scales(family("scale_"))
+        opacity = sigmoid(table["opacity"].astype(np.float64)) if "opacity" in names else np.ones(len(table))
+        if "opacity" not in names:
+            notes.append("has no opacities: opaque")
+        if scales.shape[1] == 2:  # 2D Gaussian splatting stores discs; a thousandth keeps them solid and invertible
+            scales = np.concatenate([scales, 1e-3 * scales.min(axis=1, keepdims=True)], axis=1)
+        elif scales.shape[1] == 1:
+            scales = np.repeat(scales, 3, axis=1)
+        if "filter_3D" in names:
+            notes.append("the filter of Mip-Splatting, filter_3D, is applied to scales and opacities")
+            wider = np.sqrt(scales.astype(np.float64) ** 2 + table["filter_3D"].astype(np.float64)[:, None] ** 2)
+            opacity, scales = opacity * (scales / wider).prod(axis=1), wider
+    unread = [name for name in names if name not in _KNOWN and not name.startswith(_FAMILIES)]
+    if unread:
+        notes.append(f"properties that are not read: {', '.join(unread[:12])}")
+    return sound_splats(
+        f"splat file {path}",
+        means=columns_of(table, ("x", "y", "z")),
+        quats=columns_of(table, ("rot_1", "rot_2", "rot_3", "rot_0")),
         scales=scales,
-        opacities=sigmoid(table["opacity"].astype(np.float64)),
+        opacities=opacity,
         sh=sh,
-        name=f"splat file {path}",
+        notes=notes,
     )
 
 
-def _parse_header(head: bytes, name: str) -> tuple[list[_Element], int]:
-    """Return the elements and the offset of the data."""
-    match = re.search(rb"(?:^|\n)end_header\r?\n", head)
-    if not head.startswith(b"ply") or match is None:
-        raise unreadable(name, f"no PLY header within {_HEADER_LIMIT} bytes")
-    elements: list[_Element] = []
-    form = ""
-    for line in head[: match.start()].decode("ascii", "replace").splitlines()[1:]:
-        words = line.split()
-        if not words or words[0] in ("comment", "obj_info"):
-            continue
-        if words[0] == "format" and len(words) == 3:
-            form = words[1]
-        elif words[0] == "element" and len(words) == 3 and words[2].isdecimal() and len(words[2]) <= 12:
-            elements.append(_Element(name=words[1], count=int(words[2]), properties=[]))
-        elif words[0] == "property" and len(words) == 3 and words[1] in _PLY_TYPES and elements:
-            if any(words[2] == known for known, _ in elements[-1].properties):
-                raise unreadable(name, f"property {words[2][:80]} is declared twice")
-            elements[-1].properties.append((words[2], _PLY_TYPES[words[1]]))
-        else:
-            raise unreadable(
-                name,
-                f"unreadable header line {line[:80]!r}",
-                hint="Splat files hold scalar properties only; a mesh .ply is no splat file",
-            )
-    if form != "binary_little_endian":
-        raise unreadable(name, f"format {form or 'missing'!r}, expected binary_little_endian", hint="Export as binary")
-    return elements, match.end()
-
-
-def _check_columns(vertex: _Element, name: str) -> None:
-    """Raise an AssetError unless the vertex element has the columns of an INRIA `.ply`."""
-    names = {field for field, _ in vertex.properties}
-    missing = [field for field in _PLY_COLUMNS if field not in names]
+def _check_columns(names: set[str], path: str) -> None:
+    """Raise an AssetError unless the vertex element has what splats need."""
+    missing = [name for name in ("x", "y", "z", "scale_0", *(f"rot_{i}" for i in range(4))) if name not in names]
     if missing:
         raise unreadable(
-            name,
+            path,
             f"properties {', '.join(missing)} are missing",
-            hint="Only splat .ply files (f_dc, opacity, scale, rot) can be read; a point cloud or a mesh is none",
+            hint="Splats need scale and rot; name a point cloud or a mesh where an object is asked for, as in `load`",
         )
-    rest = {field for field in names if field.startswith("f_rest_")}
-    if len(rest) not in (0, 9, 24, 45) or rest != {f"f_rest_{i}" for i in range(len(rest))}:
-        raise unreadable(name, f"{len(rest)} f_rest properties, expected f_rest_0.. of 0, 9, 24 or 45")
+    for prefix, counts in (("f_dc_", (0, 3)), ("f_rest_", (0, 9, 24, 45, 72)), ("scale_", (1, 2, 3)), ("rot_", (4,))):
+        found = {name for name in names if name.startswith(prefix)}
+        if len(found) not in counts or found != {f"{prefix}{i}" for i in range(len(found))}:
+            expected = f"{prefix}0.. of {', '.join(map(str, counts))}"
+            raise unreadable(path, f"{len(found)} {prefix[:-1]} properties, expected {expected}", hint=REEXPORT)
 
 
 def write_ply(path: str | os.PathLike[str], splats: Splats) -> None:

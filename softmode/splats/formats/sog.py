@@ -22,7 +22,15 @@ from PIL import Image
 from softmode.errors import AssetError
 from softmode.files import open_file, open_zip, read_file
 from softmode.foreign.child.layers import inside
-from softmode.splats.formats.common import FREE_BYTES, MAX_RATIO, exp_scales, quats_from_smallest_three, unreadable
+from softmode.splats.formats.common import (
+    ANTIALIASED,
+    FREE_BYTES,
+    MAX_RATIO,
+    exp_scales,
+    quats_from_smallest_three,
+    sound_splats,
+    unreadable,
+)
 from softmode.splats.splats import MAX_SPLATS, Splats
 
 _META_LIMIT = 16 * 1024 * 1024
@@ -81,11 +89,16 @@ def _folder_reader(folder: Path, meta: str = "meta.json") -> _Reader:
 
 
 def _archive_reader(archive: zipfile.ZipFile, source: str) -> _Reader:
-    """Return a reader of the members of a `.sog` archive, bounded against decompression bombs."""
+    """Return a reader of the members of a `.sog` archive, bounded against decompression bombs.
+
+    The members may lie in a folder, as where the folder itself was packed.
+    """
+    metas = [name for name in archive.namelist() if re.fullmatch(r"([^/]+/)?meta\.json", name)]
+    folder = min(metas, key=len, default="meta.json").removesuffix("meta.json")
 
     def read(name: str, limit: int) -> bytes:
         try:
-            info = archive.getinfo(name)
+            info = archive.getinfo(folder + name)
         except KeyError:
             raise unreadable(source, f"member {name} is missing") from None
         if info.file_size > limit:
@@ -220,13 +233,14 @@ def _decode(source: str, read: _Reader) -> Splats:
     if "shN" in meta:
         with np.errstate(over="ignore"):
             sh = np.concatenate([sh.astype(np.float32), _decode_palette(meta["shN"], pixels, image)], axis=1)
-    return Splats(
+    return sound_splats(
+        f"splat file {source}",
         means=means,
         quats=wxyz[:, [1, 2, 3, 0]],
         scales=scales,
         opacities=color[:, 3] / 255.0,
         sh=sh,
-        name=f"splat file {source}",
+        notes=[ANTIALIASED] if "antialias" in meta and meta["antialias"].value else [],
     )
 
 

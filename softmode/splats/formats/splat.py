@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from softmode.files import open_file, whole_file
-from softmode.splats.formats.common import check_count, read_exactly, sh_from_colors, unreadable
+from softmode.splats.formats.common import check_count, read_exactly, sh_from_colors, sound_splats, unreadable
 from softmode.splats.splats import SH_DC, Splats
 
 _RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("wxyz", "u1", 4)])
@@ -32,13 +32,13 @@ def read_splat(path: str | os.PathLike[str]) -> Splats:
         count = check_count(size // _RECORD.itemsize, str(file_path))
         table = np.frombuffer(read_exactly(file, count * _RECORD.itemsize, file_path), dtype=_RECORD)
     wxyz = (table["wxyz"].astype(np.float64) - 128.0) / 128.0
-    return Splats(
+    return sound_splats(
+        f"splat file {file_path}",
         means=table["mean"],
         quats=wxyz[:, [1, 2, 3, 0]],
         scales=table["scale"],
         opacities=table["rgba"][:, 3] / 255.0,
         sh=sh_from_colors(table["rgba"][:, :3] / 255.0),
-        name=f"splat file {file_path}",
     )
 
 

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from softmode.errors import ConfigError, MissingExtraError
 from softmode.files import open_file, whole_file
 from softmode.splats.formats.common import (
+    ANTIALIASED,
     FREE_BYTES,
     MAX_RATIO,
     check_count,
@@ -31,6 +32,7 @@ from softmode.splats.formats.common import (
     quats_from_smallest_three,
     read_exactly,
     smallest_three_from_quats,
+    sound_splats,
     unreadable,
 )
 from softmode.splats.splats import Splats
@@ -197,14 +199,15 @@ def _decode(header: _Header, arrays: dict[str, Any], path: str) -> Splats:
     if header.degree:
         rest = table("sh", 3 * ((header.degree + 1) ** 2 - 1)).reshape(header.count, -1, 3)
         steps = np.arange(-128.0, 128.0, dtype=np.float32) / np.float32(128.0)
-        sh = np.concatenate([sh.astype(np.float32), steps[rest[:, :15]]], axis=1)
-    return Splats(
+        sh = np.concatenate([sh.astype(np.float32), steps[rest]], axis=1)
+    return sound_splats(
+        f"splat file {path}",
         means=means,
         quats=quats,
         scales=exp_scales(table("scales", 3) / 16.0 - 10.0),
         opacities=table("alphas", 1)[:, 0] / 255.0,
         sh=sh,
-        name=f"splat file {path}",
+        notes=[ANTIALIASED] if header.flags & _ANTIALIASED else [],
     )
 
 

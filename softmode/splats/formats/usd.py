@@ -13,6 +13,7 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -26,7 +27,7 @@ from softmode.errors import AssetError, ConfigError, MissingExtraError
 from softmode.files import whole_file
 from softmode.foreign import process
 from softmode.foreign.openusd import pxr
-from softmode.splats.formats.common import REEXPORT, typed_errors, unreadable
+from softmode.splats.formats.common import REEXPORT, near_zero, offset_note, sound_splats, typed_errors, unreadable
 from softmode.splats.splats import MAX_SPLATS, Splats, UpAxis, joined, rotate_sh, up_rotation
 
 _LIMITS = process.Limits(memory=128 * 2.0**20, memory_per_byte=16.0, seconds=1.0)
@@ -59,10 +60,8 @@ def read_usd(path: str | os.PathLike[str], *, time_code: float | None = None) ->
 
 def _read_stage(file: Path, time_code: float | None) -> Splats:
     """Open the stage in a process of its own and join what that sends back."""
-    with tempfile.TemporaryDirectory() as folder:
-        request = process.make_request("splats", file, f"{folder}/answer", asset_root=None, limits=_LIMITS)
-        request |= {"time": None if time_code is None else float(time_code), "most": MAX_SPLATS}
-        answer = process.ask(request, name=f"splat file {file}")
+    time = None if time_code is None else float(time_code)
+    answer = process.read("splats", file, name=f"splat file {file}", limits=_LIMITS, time=time, most=MAX_SPLATS)
     stage = answer.described
     if not stage["prims"]:
         raise unreadable(
@@ -73,14 +72,17 @@ def _read_stage(file: Path, time_code: float | None) -> Splats:
     parts: list[Splats] = []
     for prim in stage["prims"]:
         splats = splats_from_prim(prim, answer.arrays, f"splat file {file}: {prim['path']}")
-        parts.append(placed(splats, np.array(prim["matrix"]).reshape(4, 4).T))
+        parts.append(placed(splats, np.array(prim["matrix"]).reshape(4, 4).T, center=True))
     if stage["up"] not in UP_AXES:
         raise unreadable(file, f"upAxis is {stage['up'][:20]!r}", hint="Set it to X, Y or Z")
     up = up_rotation(UP_AXES[stage["up"]])
     meters = float(stage["meters"])
     if not (np.isfinite(meters) and meters > 0.0):
         raise unreadable(file, f"metersPerUnit is {meters}", hint="Set it to the length of the unit in m")
-    return joined(parts, f"splat file {file}").transformed(rotation=up, scale=meters)
+    found = joined(parts, f"splat file {file}").transformed(rotation=up, scale=meters)
+    for text in stage["warnings"]:
+        warnings.warn(f"splat file {file}: {text}", stacklevel=4)
+    return replace(found, notes=(*found.notes, *stage["warnings"], *stage["notes"]))
 
 
 def splats_from_prim(prim: dict[str, Any], sent: list[NDArray[Any]], name: str) -> Splats:
@@ -111,40 +113,56 @@ def _from_arrays(prim: dict[str, Any], arrays: dict[str, NDArray[np.float32]], n
             hint="Export the splats with sRGB radiance, as trained",
         )
     count = len(arrays["positions"])
-    coefficients = np.zeros((count, 1, 3), dtype=np.float32)
+    coefficients, notes = np.zeros((count, 1, 3), dtype=np.float32), []
     if _SH in arrays:
         degree = prim["degree"]
-        if type(degree) is not int or not 0 <= degree <= 3 or len(arrays[_SH]) != count * (degree + 1) ** 2:
+        if type(degree) is not int or not 0 <= degree <= 4 or len(arrays[_SH]) != count * (degree + 1) ** 2:
             raise AssetError(
                 f"{name}: {len(arrays[_SH])} spherical-harmonic coefficients for {count} splats of degree {degree}, "
-                "expected degree 0 to 3 with (degree + 1)^2 for each splat",
+                "expected degree 0 to 4 with (degree + 1)^2 for each splat",
                 hint=REEXPORT,
             )
         coefficients = arrays[_SH].reshape(count, -1, 3)
-    return Splats(
+    else:
+        notes.append("has no colours: grey")
+    for key in ("orientations", "scales", "opacities"):
+        if key in arrays and len(arrays[key]) != count:
+            raise AssetError(f"{name}: {len(arrays[key])} {key} for {count} splats", hint=REEXPORT)
+    return sound_splats(
+        name,
         means=arrays["positions"],
         quats=arrays.get("orientations", np.tile([0.0, 0.0, 0.0, 1.0], (count, 1))),
         scales=arrays["scales"],
         opacities=arrays["opacities"][:, 0] if "opacities" in arrays else np.ones(count),
         sh=coefficients,
-        name=name,
+        notes=notes,
     )
 
 
-def placed(splats: Splats, matrix: NDArray[np.float64]) -> Splats:
-    """Return the splats under the affine map of a prim (column vectors, shape (4, 4))."""
-    linear, offset = matrix[:3, :3], matrix[:3, 3]
+def placed(splats: Splats, matrix: NDArray[np.float64], *, center: bool = False) -> Splats:
+    """Return the splats under the affine map of a prim (column vectors, shape (4, 4)).
+
+    An offset that the splats have becomes part of the map; a new one is taken off only if `center` asks for it.
+    """
+    linear, shift = matrix[:3, :3], matrix[:3, 3]
     determinant = np.linalg.det(linear)
     if not (np.isfinite(matrix).all() and abs(determinant) > 0.0):
         raise AssetError(f"{splats.name}: its transform is singular", hint="Give the prim scales other than zero")
+    if any(splats.offset):
+        shift = shift + linear @ splats.offset
+    away = near_zero(splats.means @ linear.T + shift)[1] if center else (0.0, 0.0, 0.0)
+    told = tuple(note for note in splats.notes if note not in offset_note(splats.offset))
+    splats = replace(splats, offset=(0.0, 0.0, 0.0), notes=told)
     if determinant < 0.0:  # mirrored: a reflection of x first, then a map that keeps handedness
         means, quats = splats.means * np.array([-1.0, 1.0, 1.0]), splats.quats * np.array([1.0, -1.0, -1.0, 1.0])
         splats = replace(splats, means=means, quats=quats, sh=rotate_sh(splats.sh, _MIRROR))
         linear = linear @ _MIRROR
-    scale = abs(determinant) ** (1.0 / 3.0)
+    scale, shift = abs(determinant) ** (1.0 / 3.0), shift - away
     if np.allclose(linear @ linear.T, scale**2 * np.eye(3), atol=1e-6 * scale**2):
-        return splats.transformed(rotation=linear / scale, translation=offset, scale=scale)
-    return splats.deformed(splats.means.astype(np.float64) @ linear.T + offset, linear)
+        moved = splats.transformed(rotation=linear / scale, translation=shift, scale=scale)
+    else:
+        moved = splats.deformed(splats.means.astype(np.float64) @ linear.T + shift, linear)
+    return replace(moved, offset=away, notes=(*told, *offset_note(away))) if any(away) else moved
 
 
 def write_usd(path: str | os.PathLike[str], splats: Splats | Sequence[Splats], *, fps: float = 24.0) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from softmode.envs.position_goals import GoalReward, PositionGoalMethods, PositionGoals, check_goal_reward
+from softmode.envs.position_goals import PositionGoalMethods, PositionGoals
 from softmode.envs.soft_env import SoftEnv
 from softmode.envs.soft_vector_env import SoftVectorEnv
 from softmode.envs.tasks.lift_soft.task import LiftSoft, LiftSoftConfig
@@ -14,13 +14,9 @@ from softmode.envs.tasks.lift_soft.task import LiftSoft, LiftSoftConfig
 class LiftSoftGoalConfig(LiftSoftConfig):
     """Goal and reward of LiftSoftGoal."""
 
-    reward: GoalReward = "sparse"
-    """"sparse": 0 at the goal and -1 elsewhere; "distance": minus the distance [m]."""
-
-    def __post_init__(self) -> None:
-        """Check the reward."""
-        super().__post_init__()
-        check_goal_reward(self.reward)
+    terms_follow_mode = True
+    reward_mode: str = "sparse"
+    """"sparse": 0 at the goal and -1 elsewhere; "dense": minus the distance [m]."""
 
 
 class LiftSoftGoal(PositionGoals, LiftSoft):

@@ -146,6 +146,10 @@ class PlaceInBinConfig(TaskConfig):
         require_fields(self, ("rest_speed",), above=0.0, unit="m/s")
         require_fields(self, ("hold_steps",), at_least=1)
 
+    def spots(self) -> tuple[tuple[float, float, float], ...]:
+        """Return places over the middle of the bin, between its walls and over its rim."""
+        return tuple((*self.bin.position, self.bin.height + up) for up in (0.03, 0.09))
+
     @classmethod
     def presets(cls) -> Mapping[str, Self]:
         """Return "plush": three plush toys, which cost more time."""
@@ -171,6 +175,7 @@ class PlaceInBin(Task):
     config_class = PlaceInBinConfig
     kernels = kernels
     grasps = True
+    any_robot = True
     takes_sets = True
     takes_several = True
     term_names = tuple(kernels.Term.__members__)

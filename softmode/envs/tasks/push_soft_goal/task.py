@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from softmode.envs.position_goals import GoalReward, PositionGoalMethods, PositionGoals, check_goal_reward
+from softmode.envs.position_goals import PositionGoalMethods, PositionGoals
 from softmode.envs.soft_env import SoftEnv
 from softmode.envs.soft_vector_env import SoftVectorEnv
 from softmode.envs.tasks.push_soft.task import PushSoft, PushSoftConfig
@@ -15,13 +15,13 @@ from softmode.errors import ConfigError
 class PushSoftGoalConfig(PushSoftConfig):
     """Goal and reward of PushSoftGoal."""
 
-    reward: GoalReward = "sparse"
-    """"sparse": 0 at the goal and -1 elsewhere; "distance": minus the distance [m]."""
+    terms_follow_mode = True
+    reward_mode: str = "sparse"
+    """"sparse": 0 at the goal and -1 elsewhere; "dense": minus the distance [m]."""
 
     def __post_init__(self) -> None:
-        """Check the reward."""
+        """Refuse goals that are no places."""
         super().__post_init__()
-        check_goal_reward(self.reward)
         if self.yaw_tolerance is not None:
             raise ConfigError(
                 f"yaw_tolerance is {self.yaw_tolerance}, the goals of PushSoftGoal are places", hint="leave it None"

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal, get_args
 
 import numpy as np
 
-from softmode.checks import require_choice, require_fields, require_number, require_range
+from softmode.checks import require_fields, require_number, require_range
 from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.materials.material import Material
 from softmode.envs.presets import RL_SOLVER
@@ -17,8 +16,6 @@ from softmode.objects.config import ObjectConfig
 from softmode.robots.arm import ArmDescription
 from softmode.robots.control import ArmControlOptions
 from softmode.scenes.table_scene import TableSceneConfig
-
-RewardType = Literal["dense", "sparse", "log_mass"]
 
 POST = ObjectConfig(
     shape="cylinder",
@@ -59,7 +56,9 @@ class ShapeSoftConfig(TaskConfig):
     """Range of the displacement of the free end in the target shape [m]."""
     goal_direction: tuple[float, float] = (-np.pi, np.pi)
     """Range of the direction in which it is bent, about z from the x axis [rad]."""
-    reward: RewardType = "dense"
+    reward_modes = ("dense", "sparse", "log_mass")
+    terms_follow_mode = True
+    reward_mode: str = "dense"
     """"dense": 1 - tanh(error / `reward_length`), and 1 more at the target; "sparse": 0 there and -1 elsewhere;
     "log_mass": as dense, with the distance of masses on a grid (:class:`softmode.mpm.MassLoss`), which needs no points
     that correspond."""
@@ -89,10 +88,10 @@ class ShapeSoftConfig(TaskConfig):
             raise ConfigError(
                 f"scale_range is {self.scale_range}", hint="a clamped object keeps its scale; leave it out"
             )
-        if goal is not None and self.reward != "log_mass":
+        if goal is not None and self.reward_mode != "log_mass":
             raise ConfigError(
-                f"goal_object needs points that do not correspond, reward is {self.reward!r}",
-                hint='take reward="log_mass"',
+                f"goal_object needs points that do not correspond, reward_mode is {self.reward_mode!r}",
+                hint='take reward_mode="log_mass"',
             )
         if goal is not None and (
             goal.extents is None or any(goal.extents[2] != one for one in heights) or not goal.clamped_height > 0.0
@@ -104,7 +103,6 @@ class ShapeSoftConfig(TaskConfig):
         require_range("goal_displacement", self.goal_displacement, at_least=0.0, at_most=0.6 * height, unit="m")
         require_number("goal_displacement[1]", self.goal_displacement[1], above=0.0, unit="m")
         require_range("goal_direction", self.goal_direction, at_least=-np.pi, at_most=np.pi, unit="rad")
-        require_choice("reward", self.reward, get_args(RewardType))
         require_fields(self, ("reward_length", "goal_tolerance"), above=0.0, at_most=0.1, unit="m")
         require_number("log_mass_spacing", self.log_mass_spacing, above=0.0, at_most=0.1, unit="m")
         require_fields(self, ("log_mass_length", "log_mass_tolerance"), above=0.0, at_most=1.0)

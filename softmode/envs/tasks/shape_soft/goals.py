@@ -17,8 +17,8 @@ POINTS = 12
 
 def reward_rules(config: ShapeSoftConfig) -> Any:
     """Return what the reward depends on beside the goals."""
-    rules = filled(kernels.Rules, config, point_count=POINTS, sparse=int(config.reward == "sparse"))
-    if config.reward == "log_mass":
+    rules = filled(kernels.Rules, config, point_count=POINTS, sparse=int(config.reward_mode == "sparse"))
+    if config.reward_mode == "log_mass":
         rules.reward_length, rules.goal_tolerance = config.log_mass_length, config.log_mass_tolerance
     else:
         rules.log_mass_spacing = 0.0
