@@ -16,7 +16,7 @@ from pathlib import Path
 import warp as wp
 
 from benchmarks.accuracy_runner import Result, Row, run_all
-from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.reduction.options import BuildOptions
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from tests.oracle.scenes import KAPPAS, SCENES
 

@@ -22,13 +22,13 @@ from numpy.typing import NDArray
 
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.body.regions import Region
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature_grid import Quadrature
-from softmode.deformables.build.quadrature_mesh import quadrature_from_mesh
 from softmode.deformables.materials.material import Material
 from softmode.deformables.materials.material_kernels import MaterialModel
 from softmode.deformables.model.authoring import add_pins, add_reduced_body, register_custom_attributes
+from softmode.deformables.quadrature.quadrature_grid import Quadrature
+from softmode.deformables.quadrature.quadrature_mesh import quadrature_from_mesh
+from softmode.deformables.reduction.build_body import build_body
+from softmode.deformables.reduction.options import BuildOptions
 from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
 from softmode.errors import ConfigError
 from tests.oracle import frames

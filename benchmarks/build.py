@@ -19,10 +19,10 @@ from threadpoolctl import threadpool_limits
 from benchmarks.record import add_record_option, record
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.body.regions import Region
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_box, quadrature_from_splats
-from softmode.deformables.build.quadrature_grid import Quadrature
+from softmode.deformables.quadrature.quadrature import quadrature_from_box, quadrature_from_splats
+from softmode.deformables.quadrature.quadrature_grid import Quadrature
+from softmode.deformables.reduction.build_body import build_body
+from softmode.deformables.reduction.options import BuildOptions
 from softmode.splats import make_plush
 
 LEFT = Region(name="left", box=((-np.inf,) * 3, (-2.0, np.inf, np.inf)))

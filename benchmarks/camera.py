@@ -26,7 +26,7 @@ import warp as wp
 from benchmarks.camera_scene import DILATION, SceneCamera, blob, handle_scene, intrinsics, orbit
 from benchmarks.clock import Clock
 from benchmarks.step import product_rate
-from softmode.splats.rasterizer_kernels import TILE
+from softmode.splats.raster.rasterizer_kernels import TILE
 from tests.splats.dense_reference import render_dense
 
 TOLERANCE = 1e-5

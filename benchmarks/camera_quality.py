@@ -13,7 +13,7 @@ import numpy as np
 from benchmarks.camera_scene import SceneCamera, blob, handle_scene, intrinsics, orbit
 from benchmarks.clock import Clock
 from benchmarks.peers_newton import NewtonCamera
-from softmode.splats.pinhole import MAX_EDGE
+from softmode.splats.raster.pinhole import MAX_EDGE
 from softmode.splats.splats import Splats
 
 SUPERSAMPLING = 8

@@ -14,7 +14,7 @@ import numpy as np
 import warp as wp
 
 from softmode.deformables.skinning.skin_splats import SkinSplats
-from softmode.splats.rasterizer import RasterizerOptions, SplatArrays, SplatRasterizer, ViewArrays
+from softmode.splats.raster.rasterizer import RasterizerOptions, SplatArrays, SplatRasterizer, ViewArrays
 from softmode.splats.splats import SH_DC, Splats, quats_from_rotations
 
 FIELD_OF_VIEW = 0.8

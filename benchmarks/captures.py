@@ -15,7 +15,7 @@ from unittest import mock
 
 import numpy as np
 
-from softmode.deformables.build.quadrature import quadrature_from_points, quadrature_from_splats
+from softmode.deformables.quadrature.quadrature import quadrature_from_points, quadrature_from_splats
 from softmode.objects import ObjectConfig, load
 from softmode.objects.pipeline import standing_quadrature
 from softmode.objects.source import object_source

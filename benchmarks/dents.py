@@ -12,9 +12,9 @@ import numpy as np
 import warp as wp
 
 from softmode.deformables.body.reduced_body import ReducedBody
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_box, quadrature_from_sphere
+from softmode.deformables.quadrature.quadrature import quadrature_from_box, quadrature_from_sphere
+from softmode.deformables.reduction.build_body import build_body
+from softmode.deformables.reduction.options import BuildOptions
 from tests.bodies import smooth_ball as ball
 from tests.deformables.test_dents import RADIUS, RATIO, Press, hertz
 

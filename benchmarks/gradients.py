@@ -15,12 +15,12 @@ import numpy as np
 import warp as wp
 
 from softmode.deformables.body.reduced_body import ReducedBody
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_box
 from softmode.deformables.gradients.adjoint import AdjointOptions, AdjointReduced
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_pins, add_reduced_body, register_custom_attributes
+from softmode.deformables.quadrature.quadrature import quadrature_from_box
+from softmode.deformables.reduction.build_body import build_body
+from softmode.deformables.reduction.options import BuildOptions
 from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
 
 STEPS, DT = 60, 1.0 / 60.0

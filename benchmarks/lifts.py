@@ -22,7 +22,7 @@ from softmode.envs.tasks.lift_soft.log import LiftLog
 from softmode.envs.tasks.lift_soft.task import LiftSoftConfig, LiftSoftEnv, lift_scene
 from softmode.errors import GraspError, SoftmodeError
 from softmode.objects.config import ObjectConfig
-from softmode.objects.presets import PRESETS
+from softmode.objects.shapes.presets import PRESETS
 from softmode.splats.colored_mesh import ColoredMesh
 from tests.captures import CAPTURES
 from tests.shapes import SHAPES

@@ -17,10 +17,10 @@ import warp as wp
 
 from benchmarks.step import SIZE, Beam, product_rate
 from softmode.deformables.body.reduced_body import ReducedBody
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_mesh
-from softmode.deformables.build.quadrature_grid import Quadrature
+from softmode.deformables.quadrature.quadrature import quadrature_from_mesh
+from softmode.deformables.quadrature.quadrature_grid import Quadrature
+from softmode.deformables.reduction.build_body import build_body
+from softmode.deformables.reduction.options import BuildOptions
 
 MOST, REPEATS, MOVED = 160, 20, 0.25
 """Functions, steps that are timed, and how far corners are moved at most, over the shortest edge."""

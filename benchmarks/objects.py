@@ -18,9 +18,9 @@ import newton
 import numpy as np
 import warp as wp
 
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.reduced_stiffness import reduced_stiffness
 from softmode.deformables.model.authoring import add_reduced_body
+from softmode.deformables.reduction.options import BuildOptions
+from softmode.deformables.reduction.reduced_stiffness import reduced_stiffness
 from softmode.deformables.solver.solver_reduced import SolverReduced
 from softmode.objects import ObjectConfig, load, task_objects
 from tests.objects.test_primitives import hang, heavy_elastica

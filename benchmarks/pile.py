@@ -12,11 +12,11 @@ import numpy as np
 import warp as wp
 
 from benchmarks.clock import held
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_box
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body, register_custom_attributes
+from softmode.deformables.quadrature.quadrature import quadrature_from_box
+from softmode.deformables.reduction.build_body import build_body
+from softmode.deformables.reduction.options import BuildOptions
 from softmode.deformables.solver.solver_reduced import SolverReduced
 
 DT = 0.004

@@ -29,7 +29,7 @@ from benchmarks.record import add_record_option, record
 from benchmarks.step import product_rate, report_torch
 from examples.swaying_plant import BUILD, RATE, STEPS, blow, make_plant, make_scene
 from softmode.deformables import BuildOptions
-from softmode.deformables.build.sources import unpack_sources
+from softmode.deformables.reduction.sources import unpack_sources
 from softmode.deformables.solver.evaluate import assemble, evaluate, evaluate_trial, gather_gradient
 from softmode.deformables.solver.minimise import accept_step, check_convergence, start_line_search
 

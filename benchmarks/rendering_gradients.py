@@ -16,9 +16,9 @@ import warp as wp
 from softmode.deformables.skinning.skin_splats import SkinSplats
 from softmode.deformables.skinning.skinning_adjoint import AdjointSkinning
 from softmode.splats import Splats
-from softmode.splats.rasterizer import SplatArrays, SplatRasterizer, ViewArrays
-from softmode.splats.rasterizer_adjoint import AdjointRasterizer
-from softmode.splats.rasterizer_kernels import vec6
+from softmode.splats.raster.rasterizer import SplatArrays, SplatRasterizer, ViewArrays
+from softmode.splats.raster.rasterizer_adjoint import AdjointRasterizer
+from softmode.splats.raster.rasterizer_kernels import vec6
 from tests.splats.test_rasterizer import ball, look_at
 from tests.splats.test_rasterizer_adjoint import HEIGHT, NAMES, WIDTH, Scene
 

@@ -23,8 +23,8 @@ from typing import Any
 import warp as wp
 
 from benchmarks.springs import NAMES, print_springs
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.reduction.build_body import build_body
+from softmode.deformables.reduction.options import BuildOptions
 from softmode.errors import SoftmodeError
 from tests.oracle.solids import SOLIDS
 from tests.shape_trials import base_of, drop, solve_reference, try_build, try_pull, voxelise

@@ -27,14 +27,14 @@ from PIL import Image
 from scipy.ndimage import binary_dilation
 
 from softmode.deformables.body.reduced_body import ReducedBody
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_box
+from softmode.deformables.quadrature.quadrature import quadrature_from_box
+from softmode.deformables.reduction.build_body import build_body
+from softmode.deformables.reduction.options import BuildOptions
 from softmode.deformables.skinning.skin_splats import STRETCH_LIMIT, SkinSplats, average_basis
 from softmode.objects import ObjectConfig, load
 from softmode.splats import Splats
-from softmode.splats.pinhole import PinholeCamera
-from softmode.splats.rasterizer import RasterizerOptions, SplatArrays, SplatRasterizer, ViewArrays
+from softmode.splats.raster.pinhole import PinholeCamera
+from softmode.splats.raster.rasterizer import RasterizerOptions, SplatArrays, SplatRasterizer, ViewArrays
 from softmode.splats.splats import SH_DC, quats_from_rotations, rotations_from_quats
 
 Array = NDArray[np.float64]
@@ -200,7 +200,8 @@ class Moved:
         """Evaluate the functions."""
         self.splats = splats
         widths = splats.covariances() if averaged else np.tile(1e-30 * np.eye(3), (splats.count, 1, 1))
-        self.basis, self.gradient = average_basis(SimpleNamespace(values=values, narrow=0.0), splats.means, widths)
+        functions: Any = SimpleNamespace(values=values, narrow=0.0)
+        self.basis, self.gradient = average_basis(functions, splats.means, widths)
 
     @classmethod
     def by(cls, motion: Motion, splats: Splats, **options: Any) -> Moved:
@@ -293,16 +294,6 @@ def bar_body(mode_count: int = 16) -> ReducedBody:
     """Return a reduced body of the bar; its frame is the bar's."""
     options = BuildOptions(mode_count=mode_count, cubature_count=None)
     return build_body(quadrature_from_box((LENGTH, WIDTH, HEIGHT)), options, progress=False)
-
-
-def body_values(body: ReducedBody) -> Callable[[Array], Array]:
-    """Return the functions of a body, evaluated in portions."""
-
-    def values(x: Array) -> Array:
-        parts = np.array_split(x, -(-len(x) // 20000))
-        return np.concatenate([body.evaluate(part)[0] for part in parts])
-
-    return values
 
 
 # -- table ------------------------------------------------------------------------------------------------------------
@@ -406,7 +397,7 @@ def main() -> None:
     print("PSNR [dB] and spikes (pixels wrong by > 0.1 beyond 3 px around the object, as a share of its own)")
     measure("bar", exact, exactly, bar, dense, pictures=arguments.pictures)
     measure("bar coarse", exact, exactly, sample_bar(0.008), dense, pictures=arguments.pictures)
-    values = body_values(bar_body())
+    values = bar_body().values
     measure("bar 16 modes", exact[:4], ties(values), bar, sample_bar(0.0007), pictures=arguments.pictures)
     if arguments.splat:
         thing = load(ObjectConfig(splat=arguments.splat, size=0.25, build=BuildOptions(mode_count=16)))
@@ -420,7 +411,7 @@ def main() -> None:
             ("torn across", upright(rip(0.6 * high, 0.02 * high, 2))),
             ("torn apart", upright(rip(0.3 * high, 0.02 * high))),
         ]
-        values = body_values(thing.body)
+        values = thing.body.values
         measure(
             "file 16 modes",
             loose,

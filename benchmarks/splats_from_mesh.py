@@ -19,10 +19,10 @@ import warp as wp
 from softmode.objects.mesh_file import read_mesh
 from softmode.objects.mesh_fit import FitOptions, splats_from_mesh
 from softmode.splats.colored_mesh import ColoredMesh
+from softmode.splats.fit.picture_fit import FIELD_OF_VIEW
+from softmode.splats.fit.reference_views import orbit_poses, render_mesh
 from softmode.splats.mesh_samples import sample_mesh
-from softmode.splats.picture_fit import FIELD_OF_VIEW
-from softmode.splats.rasterizer import SplatArrays, SplatRasterizer
-from softmode.splats.reference_views import orbit_poses, render_mesh
+from softmode.splats.raster.rasterizer import SplatArrays, SplatRasterizer
 from softmode.splats.splats import Splats
 from tests.splats.meshes import bumpy_sphere, checker_texture, painted_box, two_objects
 

@@ -19,8 +19,8 @@ from dataclasses import replace
 import numpy as np
 
 from softmode.deformables import BuildOptions, ReducedBody, Region, build_body, hold, quadrature_from_mesh
-from softmode.deformables.build.options import CUBATURE_COUNT
-from softmode.deformables.build.quadrature_grid import Quadrature
+from softmode.deformables.quadrature.quadrature_grid import Quadrature
+from softmode.deformables.reduction.options import CUBATURE_COUNT
 from tests.oracle.solids import SOLIDS, Bricks
 from tests.shape_trials import voxelise
 from tests.shapes import SHAPES

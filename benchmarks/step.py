@@ -22,12 +22,12 @@ import numpy as np
 import warp as wp
 
 from softmode.deformables.body.reduced_body import ReducedBody
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_box
 from softmode.deformables.materials.material import Material
 from softmode.deformables.materials.material_kernels import MaterialModel
 from softmode.deformables.model.authoring import add_pins, add_reduced_body, register_custom_attributes
+from softmode.deformables.quadrature.quadrature import quadrature_from_box
+from softmode.deformables.reduction.build_body import build_body
+from softmode.deformables.reduction.options import BuildOptions
 from softmode.deformables.solver.evaluate import assemble, gather_gradient, solve
 from softmode.deformables.solver.evaluate import evaluate as evaluate_step
 from softmode.deformables.solver.minimise import accept_step, check_convergence, start_line_search

@@ -19,7 +19,7 @@ import warp as wp
 from benchmarks.clock import Clock
 from benchmarks.step import product_rate
 from softmode.deformables.model.lane_kernels import LANES
-from softmode.deformables.solver.factor import BlockCholesky
+from softmode.deformables.system.factor import BlockCholesky
 
 
 def main() -> None:

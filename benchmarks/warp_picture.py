@@ -19,10 +19,10 @@ from PIL import Image
 from scipy.spatial import KDTree
 
 from benchmarks.splat_fidelity import HEIGHT, LENGTH, WIDTH, Motion, Moved, bend, sample_bar
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_box
-from softmode.deformables.build.quadrature_cuboids import nearest_cells
+from softmode.deformables.quadrature.quadrature import quadrature_from_box
+from softmode.deformables.quadrature.quadrature_cuboids import nearest_cells
+from softmode.deformables.reduction.build_body import build_body
+from softmode.deformables.reduction.options import BuildOptions
 
 Array = NDArray[np.float64]
 SIZE, STEP = 320, 1.0e-4

@@ -18,18 +18,18 @@ from scipy.spatial import KDTree
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.body.rkpm import make_basis
 from softmode.deformables.body.skinning_weights import SkinningWeights
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_splats
-from softmode.deformables.build.quadrature_grid import Quadrature
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body
+from softmode.deformables.quadrature.quadrature import quadrature_from_splats
+from softmode.deformables.quadrature.quadrature_grid import Quadrature
+from softmode.deformables.reduction.build_body import build_body
+from softmode.deformables.reduction.options import BuildOptions
 from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
 from softmode.objects import SoftObject
 from softmode.scenes import BoundSplats
 from softmode.splats import Splats, make_plush
-from softmode.splats.pinhole import PinholeCamera
-from softmode.splats.rasterizer import RasterizerOptions, SplatRasterizer, ViewArrays
+from softmode.splats.raster.pinhole import PinholeCamera
+from softmode.splats.raster.rasterizer import RasterizerOptions, SplatRasterizer, ViewArrays
 
 Array = NDArray[np.float64]
 

@@ -21,7 +21,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # for the finite e
 
 from softmode.deformables import Material, Region, SolverReducedOptions, add_reduced_body, build_body
 from softmode.deformables.body.reduced_body import ReducedBody
-from softmode.deformables.build.quadrature import quadrature_from_mesh
+from softmode.deformables.quadrature.quadrature import quadrature_from_mesh
 from tests.oracle.fem import Solid, static
 from tests.oracle.solids import SOLIDS, Bricks
 from tests.scenes import Scene

@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # for the finite elements of the tests
 
 from softmode.deformables.body.reduced_body import ReducedBody
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_box
-from softmode.deformables.build.reduced_stiffness import reduced_stiffness
+from softmode.deformables.quadrature.quadrature import quadrature_from_box
+from softmode.deformables.reduction.build_body import build_body
+from softmode.deformables.reduction.options import BuildOptions
+from softmode.deformables.reduction.reduced_stiffness import reduced_stiffness
 from tests.oracle.fem import free_modes
 from tests.oracle.solids import Bricks
 

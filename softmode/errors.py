@@ -136,7 +136,7 @@ class EnvironmentCheckError(SoftmodeError, AssertionError):
 
     Args:
         message: What was seen and what the rule asks.
-        rule: Name of the broken rule, one of `softmode.envs.check.RULES`.
+        rule: Name of the broken rule, one of `softmode.vector_check.RULES`.
         world: Index of the world at fault; None where no single world is.
         hint: The remedy.
     """

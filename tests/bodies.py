@@ -17,12 +17,12 @@ import numpy as np
 
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.body.regions import Region
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.cache import cached_body
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_box, quadrature_from_sphere
-from softmode.deformables.build.quadrature_grid import Quadrature
-from softmode.deformables.build.quadrature_implicit import quadrature_from_implicit
+from softmode.deformables.quadrature.quadrature import quadrature_from_box, quadrature_from_sphere
+from softmode.deformables.quadrature.quadrature_grid import Quadrature
+from softmode.deformables.quadrature.quadrature_implicit import quadrature_from_implicit
+from softmode.deformables.reduction.build_body import build_body
+from softmode.deformables.reduction.cache import cached_body
+from softmode.deformables.reduction.options import BuildOptions
 
 Given = ParamSpec("Given")
 BODIES: dict[str, Callable[..., ReducedBody]] = {}

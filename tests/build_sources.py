@@ -6,7 +6,10 @@ import hashlib
 from importlib.metadata import version
 from pathlib import Path
 
-ROOMS = ("deformables/body", "deformables/build", "deformables/materials", "objects", "radiance", "splats")
+ROOMS = (
+    *(f"deformables/{part}" for part in ("body", "materials", "quadrature", "reduction")),
+    *("objects", "radiance", "splats"),
+)
 """Rooms of the package that build a body."""
 LIBRARIES = ("numpy", "scipy", "trimesh")
 

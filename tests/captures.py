@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from softmode.objects.level_sets import Level, ball, box, cylinder, ellipsoid, torus, union, without
+from softmode.objects.shapes.level_sets import Level, ball, box, cylinder, ellipsoid, torus, union, without
 from softmode.splats.splats import SH_DC, Splats, rotations_from_quats
 
 Array = NDArray[np.float64]

@@ -42,7 +42,7 @@ def _splats(path: Path) -> None:
 
 
 def _object(path: Path) -> Any:
-    from softmode.deformables.build.sources import unpack_sources
+    from softmode.deformables.reduction.sources import unpack_sources
     from softmode.objects.object_file import file_kind, read_object
 
     file_kind(path)
@@ -148,7 +148,7 @@ def _robot(path: Path) -> None:
 def _stage(path: Path) -> None:
     import newton
 
-    from softmode.objects.stage_scene import open_scene
+    from softmode.objects.stage.scene import open_scene
     from softmode.usd.importer import _add_rest
 
     with tempfile.TemporaryDirectory() as folder:

@@ -20,8 +20,8 @@ from numpy.lib import recfunctions
 
 from softmode.errors import AssetError
 from softmode.objects.object_file import file_kind
+from softmode.objects.stage.scene import read_usd_scene
 from softmode.objects.stage_asset import read_usd_mesh
-from softmode.objects.stage_scene import read_usd_scene
 from softmode.splats import read_splats
 from softmode.splats.formats.others import OTHERS
 from softmode.splats.point_cloud import read_points

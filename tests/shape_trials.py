@@ -21,11 +21,11 @@ from scipy.sparse import linalg as sparse_linalg
 
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.body.regions import Region
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature_grid import Quadrature
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body
+from softmode.deformables.quadrature.quadrature_grid import Quadrature
+from softmode.deformables.reduction.build_body import build_body
+from softmode.deformables.reduction.options import BuildOptions
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from tests.oracle.fem import Mesh, Solid
 from tests.scenes import Scene

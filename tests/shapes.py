@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from softmode.deformables.build.quadrature import quadrature_from_points, quadrature_from_splats
-from softmode.deformables.build.quadrature_grid import Quadrature
-from softmode.deformables.build.quadrature_implicit import quadrature_from_implicit
-from softmode.deformables.build.quadrature_mesh import quadrature_from_mesh
+from softmode.deformables.quadrature.quadrature import quadrature_from_points, quadrature_from_splats
+from softmode.deformables.quadrature.quadrature_grid import Quadrature
+from softmode.deformables.quadrature.quadrature_implicit import quadrature_from_implicit
+from softmode.deformables.quadrature.quadrature_mesh import quadrature_from_mesh
 from softmode.splats import Splats
 
 Array = NDArray[np.float64]

@@ -11,7 +11,7 @@ from benchmarks.baselines import flex, reduced, vbd
 from benchmarks.baselines.common import FREE, Row, hexahedral_interpolation, lines_of
 from benchmarks.baselines.neural_weights import NeuralWeights, NeuralWeightsOptions, train_neural_weights
 from benchmarks.baselines.vbd import kuhn_interpolation, kuhn_mesh
-from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.reduction.options import BuildOptions
 
 CELLS = (3, 2, 1)
 SHORT = 40

@@ -223,8 +223,6 @@ def damaged(kind: str, folder: Path) -> str:
     data = path.read_bytes()
     if kind == "truncated":
         data = data[: len(data) // 2]
-    elif kind == "nan":
-        data = data[:-4] + np.float32(np.nan).tobytes()
     path.write_bytes(data)
     return str(path)
 
@@ -243,7 +241,6 @@ FAILURES: dict[str, tuple[list[str], str]] = {
     "parent is a file": (["--video", "{folder}/file/film.mp4"], "film.mp4"),
     "missing": (["--splat", "missing"], "missing.ply"),
     "truncated": (["--splat", "truncated"], "truncated.ply"),
-    "nan": (["--splat", "nan"], "nan.ply"),
     "flat": (["--splat", "flat"], "flat.ply"),
 }
 

@@ -17,9 +17,9 @@ from scipy.optimize import brentq
 
 from softmode.cli.main import main
 from softmode.deformables.body.reduced_body import ReducedBody
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.cubature import POISSON_RATIO
-from softmode.deformables.build.quadrature import quadrature_from_box
+from softmode.deformables.quadrature.quadrature import quadrature_from_box
+from softmode.deformables.reduction.build_body import build_body
+from softmode.deformables.reduction.cubature import POISSON_RATIO
 from softmode.errors import AssetError, ConfigError
 from softmode.objects import ObjectConfig, load, surface_cover, write_object
 from softmode.objects.object_file import file_kind, read_object

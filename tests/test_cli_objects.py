@@ -20,8 +20,8 @@ from softmode.cli import main as cli
 from softmode.cli.common import finding_line
 from softmode.cli.main import main
 from softmode.cli.object_options import ObjectOptions, stiffer_box
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.report import Finding
+from softmode.deformables.reduction.options import BuildOptions
+from softmode.deformables.reduction.report import Finding
 from softmode.demonstrations import read_dataset
 from softmode.envs.tasks.lift_soft.task import LiftSoftConfig
 from softmode.envs.tasks.place_in_bin.task import PlaceInBinConfig
@@ -485,7 +485,7 @@ def test_help_fits_a_screen_and_has_an_example(
     """Every group of options is at most a screen high; the example is a command line of this command that parses."""
     monkeypatch.setenv("COLUMNS", "80")
     said = help_of(command.split(), capsys)
-    titles = [k for k, line in enumerate(said) if re.match(r"\W*(positional arguments|(toy )?options)\W*$", line)]
+    titles = [k for k, line in enumerate(said) if re.match(r"\W*(positional arguments|((toy|arm) )?options)\W*$", line)]
     heights = np.diff([*titles, len(said)])
     assert len(titles) and heights.max() <= SCREEN, heights
     (example,) = [line for line in said if line.startswith("Example: ")]

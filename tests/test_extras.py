@@ -38,7 +38,7 @@ CASES = {
     ),
     "policy to play": ("rl", "from softmode.learning.players import policy_factory as f; f(str(Path('a.npz')), None)"),
     "TensorBoard": ("rl", "from softmode.learning.run_folder import RunFolder as R; R.start_tensorboard(None, None)"),
-    "autograd of splats": ("rl", "from softmode.splats.rasterizer_torch import _function; _function()"),
+    "autograd of splats": ("rl", "from softmode.splats.raster.rasterizer_torch import _function; _function()"),
     "autograd of steps": ("rl", "from softmode.deformables.gradients.adjoint_torch import _function; _function()"),
     "read OpenUSD": ("usd", "from softmode.splats import read_splats; read_splats('toy.usda')"),
     "write OpenUSD": (

@@ -13,9 +13,9 @@ import pytest
 from benchmarks.freeform import figures, objects, training
 from benchmarks.freeform.objects import CONDITIONS, PULL, Thing, compare, fem_motion, reduced_motion
 from softmode.deformables.body.rkpm import make_basis
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_box
+from softmode.deformables.quadrature.quadrature import quadrature_from_box
+from softmode.deformables.reduction.build_body import build_body
+from softmode.deformables.reduction.options import BuildOptions
 from tests.shape_trials import Voxels
 
 STEPS = 3

@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parents[1]
 FLOORS = (
     "softmode errors",
     "leftovers interrupts",
-    "files checks lanes lazy pause quiet versions",
+    "files checks lanes lazy pause quiet vector_check versions",
     "deformables foreign",
     "splats robots mpm",
     "radiance",
@@ -26,7 +26,19 @@ FLOORS = (
     "__main__",
 )
 """Rooms of the package from the ground; those of one floor do not import each other."""
-PARTS = ("body materials skinning", "build model", "contact", "solver", "coupling", "gradients tools", "deformables")
+PARTS = (
+    "body materials skinning",
+    "quadrature model",
+    "reduction",
+    "contact",
+    "system",
+    "potential",
+    "newton",
+    "solver",
+    "coupling",
+    "gradients tools",
+    "deformables",
+)
 """Parts of deformables from the ground; the last is the package's public face."""
 
 

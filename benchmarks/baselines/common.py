@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from threadpoolctl import threadpool_limits
 
-from softmode.deformables.build.cache import cache_directory
+from softmode.deformables.reduction.cache import cache_directory
 from softmode.files import whole_file
 from tests.oracle import frames
 from tests.oracle.fem import Mesh, simulate

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from softmode.deformables.build.cache import cache_directory, fingerprint_of
+from softmode.deformables.reduction.cache import cache_directory, fingerprint_of
 from softmode.files import whole_file
 
 

@@ -22,7 +22,7 @@ from threadpoolctl import threadpool_limits
 from benchmarks.baselines import flex, mpm, reduced, vbd
 from benchmarks.baselines.common import Row, as_record
 from benchmarks.baselines.neural_weights import NeuralWeightsOptions
-from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.reduction.options import BuildOptions
 
 Job = Callable[[int], Row]
 KERNELS = reduced.KERNELS

@@ -19,7 +19,7 @@ from benchmarks.accuracy_runner import Row, Simulation, body_of, compare, quadra
 from benchmarks.baselines.mpm import Particles
 from benchmarks.freeform.paper import MODES
 from softmode.deformables.body.reduced_body import ReducedBody
-from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.reduction.options import BuildOptions
 from tests.oracle import frames
 from tests.oracle.fem import simulate
 from tests.oracle.scenes import BEND, SCENES

@@ -13,8 +13,8 @@ from scipy import linalg
 from benchmarks.accuracy_runner import Row, Simulation, body_of
 from benchmarks.baselines.mpm import Particles
 from softmode.deformables.body.rkpm import BasisRKPM, make_basis
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_box
+from softmode.deformables.quadrature.quadrature import quadrature_from_box
+from softmode.deformables.reduction.options import BuildOptions
 from tests.oracle.scenes import BEAM, LEFT, RIGHT, Clamp, Motion, Scene
 
 Array = NDArray[np.float64]

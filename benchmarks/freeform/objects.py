@@ -22,12 +22,12 @@ from benchmarks.accuracy import FINE_RANK, affine
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.body.regions import Region
 from softmode.deformables.body.rkpm import sample_farthest
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.cache import fingerprint_of
-from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.materials.material import Material
 from softmode.deformables.materials.material_kernels import MaterialModel
 from softmode.deformables.model.authoring import add_pins, add_reduced_body
+from softmode.deformables.reduction.build_body import build_body
+from softmode.deformables.reduction.cache import fingerprint_of
+from softmode.deformables.reduction.options import BuildOptions
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from softmode.files import whole_file
 from tests.oracle.fem import ConvergenceError, Mesh, Minimiser, Solid

@@ -24,10 +24,10 @@ from benchmarks.accuracy_runner import quadrature_of
 from benchmarks.baselines.neural_weights import elastic_energy
 from benchmarks.freeform.beam import freeform, run_body
 from softmode.deformables.body.rkpm import ShapeFunctions
-from softmode.deformables.build import basis as basis_module
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.eigenmodes import Eigenmodes
-from softmode.deformables.build.galerkin import mass_and_gradient_matrix
+from softmode.deformables.reduction import basis as basis_module
+from softmode.deformables.reduction.build_body import build_body
+from softmode.deformables.reduction.eigenmodes import Eigenmodes
+from softmode.deformables.reduction.galerkin import mass_and_gradient_matrix
 from tests.oracle.scenes import BEND
 
 Array = NDArray[np.float64]

@@ -17,7 +17,7 @@ from softmode.files import check_place
 if TYPE_CHECKING:
     from softmode.deformables.body.reduced_body import ReducedBody
     from softmode.deformables.body.regions import Region
-    from softmode.deformables.build.report import BodyReport
+    from softmode.deformables.reduction.report import BodyReport
     from softmode.objects.soft_object import SoftObject
 
 
@@ -203,7 +203,7 @@ class BodyCut(_Asset):
             raise ConfigError(f"out {self.out} is no .npz file", hint="name it like toy.npz")
         base = self.path.with_suffix(".npz") if self.out is None else self.out
         check_place(base, "file", make_folders=False)
-        from softmode.deformables.build.patch import Patch
+        from softmode.deformables.reduction.patch import Patch
         from softmode.objects.cut import cut_object
         from softmode.objects.object_file import write_object
         from softmode.objects.pose import seat_of
@@ -238,9 +238,9 @@ def _six_numbers(option: str, text: str) -> list[float]:
 
 def _examined(options: _Asset) -> tuple[SoftObject, BodyReport]:
     """Return an object with its splats, and its body's report: read, or built from its asset."""
-    from softmode.deformables.build.functions import RANK_TOLERANCE
-    from softmode.deformables.build.options import BuildOptions
-    from softmode.deformables.build.report import report_body
+    from softmode.deformables.reduction.functions import RANK_TOLERANCE
+    from softmode.deformables.reduction.options import BuildOptions
+    from softmode.deformables.reduction.report import report_body
     from softmode.objects.config import ObjectConfig
     from softmode.objects.loader import load
     from softmode.objects.object_build import build_object

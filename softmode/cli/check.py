@@ -31,6 +31,7 @@ class Check:
         """Print a line per check; return 1 if one fails."""
         from softmode.envs.robots import loaded
         from softmode.learning.config_values import with_config
+        from softmode.robots.description import RobotDescription
         from softmode.testing import check_task
 
         registered_id(self.env)
@@ -39,8 +40,9 @@ class Check:
             given = self.toy.env_options(self.env, {}) | self.arm.env_options()
             options = with_config(self.env, given) if given else {}
             if "robot" in given:
-                options["robot"] = loaded(given["robot"])
-                tell_of(options["robot"])
+                options["robot"] = robot = loaded(given["robot"])
+                if isinstance(robot, RobotDescription):
+                    tell_of(robot)
             found = check_task(self.env, episodes=self.episodes, **options)
         words = {True: "ok", False: "FAILED", None: "skipped"}
         for check in found:

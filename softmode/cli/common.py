@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 from softmode.errors import ConfigError
 
 if TYPE_CHECKING:
-    from softmode.deformables.build.report import Finding
+    from softmode.deformables.reduction.report import Finding
     from softmode.objects.soft_object import SoftObject
     from softmode.robots.arm import ArmDescription
     from softmode.robots.table_robot import TableRobot

@@ -80,7 +80,7 @@ class ObjectOptions:
     @property
     def preset(self) -> str | None:
         """The preset that is named in place of a file."""
-        from softmode.objects.presets import PRESETS
+        from softmode.objects.shapes.presets import PRESETS
 
         return str(self.file) if str(self.object) in PRESETS else None
 
@@ -116,16 +116,15 @@ class ObjectOptions:
             ConfigError: If an option says nothing about this object.
         """
         from softmode.objects.config import PAINTED, ObjectConfig
-        from softmode.objects.object_file import file_kind
+        from softmode.objects.loader import object_config
 
         self.check()
         given: dict[str, Any] = self.shape
-        if self.preset is not None:
-            base = ObjectConfig(surface_count=base.surface_count, build=base.build, preset=self.preset)
-        elif self.file is not None:
-            found = "splat" if self.splat is not None else file_kind(self.file)
-            kind = "splat" if found == "points" else found
-            base = ObjectConfig(surface_count=base.surface_count, build=base.build).changed(**{kind: self.file})
+        like = {"surface_count": base.surface_count, "build": base.build}
+        if self.splat is not None:
+            base = ObjectConfig(splat=self.splat, **like)
+        elif self.object is not None:
+            base = object_config(self.object, **like)
         if base.body is not None:
             self._refuse(given, f"the body {base.body}", "give them to softmode body build")
         elif base.extents is not None:
@@ -149,7 +148,7 @@ class ObjectOptions:
             ConfigError: If an option says nothing about this object, or the task cannot have it.
         """
         from softmode.objects.object_file import read_object, stored_material
-        from softmode.objects.presets import find_preset
+        from softmode.objects.shapes.presets import find_preset
 
         thing = self.object_of(config.scene.object).pinned()
         stored = {} if thing.body is None else stored_material(read_object(thing.body).body)

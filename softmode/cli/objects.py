@@ -26,7 +26,7 @@ class ObjectsList:
 
     def run(self) -> int:
         """Print a line per preset."""
-        from softmode.objects.presets import PRESETS
+        from softmode.objects.shapes.presets import PRESETS
 
         print(f"{'name':10} {'E [Pa]':>8} {'nu':>5} {'kg/m^3':>7} {'friction':>9}  what")
         for name, preset in PRESETS.items():
@@ -56,7 +56,7 @@ class ObjectsShow:
         """Draw, write; return the exit code."""
         check_place(self.out, "sheet")
         from softmode.objects.config import ObjectConfig
-        from softmode.objects.presets import PRESETS
+        from softmode.objects.shapes.presets import PRESETS
 
         things = [ObjectConfig(preset=name, splat_count=self.splats) for name in self.names or PRESETS]
         with quiet_warp():
@@ -131,7 +131,7 @@ class ObjectsExport:
     def _write_mesh(self, config: ObjectConfig) -> None:
         """Write the surface, which files of glTF hold with y up."""
         from softmode.files import whole_file
-        from softmode.objects.presets import preset_surface
+        from softmode.objects.shapes.presets import preset_surface
         from softmode.splats.splats import up_rotation
 
         mesh = preset_surface(self.name)

@@ -75,7 +75,7 @@ class RadianceBake:
         check_splat_target(out)
         with quiet_warp():
             from softmode.radiance.bake import splats_from_radiance
-            from softmode.splats.picture_fit import FitOptions
+            from softmode.splats.fit.picture_fit import FitOptions
 
             options = FitOptions(iterations=self.iterations, size=self.pixels, seed=self.seed, samples=2)
             field = read_radiance(self.file)

@@ -196,7 +196,7 @@ def _session(options: View, show_progress: Callable[[str, float], None] | None =
     from softmode.envs.arguments import Shortcuts, checked_config
     from softmode.envs.catalogue import env_class, registered_id
     from softmode.objects.config import ObjectConfig
-    from softmode.objects.presets import PRESETS
+    from softmode.objects.shapes.presets import PRESETS
     from softmode.robots.table_robot import TableRobot
     from softmode.view.session import LiveSession
 

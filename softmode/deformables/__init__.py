@@ -12,28 +12,6 @@ from softmode.lazy import lazy_names
 if TYPE_CHECKING:
     from softmode.deformables.body.reduced_body import ReducedBody
     from softmode.deformables.body.regions import Region
-    from softmode.deformables.build.build_body import build_body
-    from softmode.deformables.build.cache import cached_body
-    from softmode.deformables.build.cut import Cut, cut_body
-    from softmode.deformables.build.eigenmodes import Eigenmodes, solve_eigenmodes
-    from softmode.deformables.build.hold import carry_over, hold, paint
-    from softmode.deformables.build.occupancy import Occupancy, fill_splats
-    from softmode.deformables.build.options import BuildOptions
-    from softmode.deformables.build.patch import Patch
-    from softmode.deformables.build.quadrature import (
-        quadrature_from_box,
-        quadrature_from_capsule,
-        quadrature_from_points,
-        quadrature_from_sphere,
-        quadrature_from_splats,
-    )
-    from softmode.deformables.build.quadrature_cuboids import with_integrator_points
-    from softmode.deformables.build.quadrature_density import quadrature_from_density
-    from softmode.deformables.build.quadrature_grid import Quadrature
-    from softmode.deformables.build.quadrature_implicit import quadrature_from_implicit
-    from softmode.deformables.build.quadrature_mesh import quadrature_from_mesh
-    from softmode.deformables.build.reduced_stiffness import elastic_modes
-    from softmode.deformables.build.report import BodyReport, report_body
     from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
     from softmode.deformables.gradients.adjoint import AdjointOptions, AdjointReduced, ReducedGradients
     from softmode.deformables.gradients.adjoint_torch import rollout
@@ -42,15 +20,37 @@ if TYPE_CHECKING:
     from softmode.deformables.model.authoring import add_pins, add_reduced_body, register_custom_attributes
     from softmode.deformables.model.status import status_reasons
     from softmode.deformables.model.velocities import set_velocity
+    from softmode.deformables.quadrature.occupancy import Occupancy, fill_splats
+    from softmode.deformables.quadrature.quadrature import (
+        quadrature_from_box,
+        quadrature_from_capsule,
+        quadrature_from_points,
+        quadrature_from_sphere,
+        quadrature_from_splats,
+    )
+    from softmode.deformables.quadrature.quadrature_cuboids import with_integrator_points
+    from softmode.deformables.quadrature.quadrature_density import quadrature_from_density
+    from softmode.deformables.quadrature.quadrature_grid import Quadrature
+    from softmode.deformables.quadrature.quadrature_implicit import quadrature_from_implicit
+    from softmode.deformables.quadrature.quadrature_mesh import quadrature_from_mesh
+    from softmode.deformables.reduction.build_body import build_body
+    from softmode.deformables.reduction.cache import cached_body
+    from softmode.deformables.reduction.cut import Cut, cut_body
+    from softmode.deformables.reduction.eigenmodes import Eigenmodes, solve_eigenmodes
+    from softmode.deformables.reduction.hold import carry_over, hold, paint
+    from softmode.deformables.reduction.options import BuildOptions
+    from softmode.deformables.reduction.patch import Patch
+    from softmode.deformables.reduction.reduced_stiffness import elastic_modes
+    from softmode.deformables.reduction.report import BodyReport, report_body
     from softmode.deformables.skinning.skin_splats import SkinSplats, average_basis
     from softmode.deformables.skinning.skinning_adjoint import AdjointSkinning
     from softmode.deformables.solver.attachments import Attachment, attach
-    from softmode.deformables.solver.energies import SoftEnergies
-    from softmode.deformables.solver.parameters import PARAMETER_FLAGS, ShapeFriction, set_parameters
     from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
+    from softmode.deformables.tools.energies import SoftEnergies
     from softmode.deformables.tools.grips import GripOptions, Grips, add_grip_slots
     from softmode.deformables.tools.inverse_map import InverseMap
     from softmode.deformables.tools.markers import Markers
+    from softmode.deformables.tools.parameters import PARAMETER_FLAGS, ShapeFriction, set_parameters
     from softmode.deformables.tools.sensing import ContactSensor, ForceTorqueSensor, SurfacePressure
 
 __all__ = [

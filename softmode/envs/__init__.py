@@ -11,7 +11,6 @@ from softmode.lazy import lazy_names
 
 if TYPE_CHECKING:
     from softmode.envs.adapters import RslRlVecEnv, SkrlWrapper, StableBaselinesVecEnv
-    from softmode.envs.check import VectorEnvReport, check_vector_env
     from softmode.envs.end_reason import EndReason
     from softmode.envs.env_state import EnvState
     from softmode.envs.observation import Segment
@@ -56,6 +55,7 @@ if TYPE_CHECKING:
         Terms,
     )
     from softmode.envs.throughput import measure_throughput
+    from softmode.vector_check import VectorEnvReport, check_vector_env
 
 __all__ = [
     "CurriculumTerm",

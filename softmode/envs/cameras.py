@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from softmode.robots.arm import ArmDescription
 from softmode.robots.table_robot import TableRobot
-from softmode.splats.pinhole import PinholeCamera
+from softmode.splats.raster.pinhole import PinholeCamera
 
 Point = tuple[float, float, float]
 

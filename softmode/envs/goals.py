@@ -11,8 +11,8 @@ import numpy as np
 import warp as wp
 
 from softmode.envs.end_reason import EndReason
-from softmode.envs.tensors import Tensor
 from softmode.errors import ConfigError
+from softmode.vector_check.tensors import Tensor
 
 Goals = np.ndarray | Tensor
 Infos = Mapping[str, Any] | Sequence[Mapping[str, Any]] | np.ndarray | None

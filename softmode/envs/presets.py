@@ -5,7 +5,7 @@ What it costs in accuracy stands in benchmarks/JOURNAL.md ("A preset for reinfor
 
 from dataclasses import replace
 
-from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.reduction.options import BuildOptions
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from softmode.scenes.table_scene import TableSceneConfig
 

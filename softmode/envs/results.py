@@ -10,7 +10,7 @@ import warp as wp
 
 from softmode.deformables.model.status import status_reasons
 from softmode.envs.task import Task
-from softmode.envs.tensors import map_tree
+from softmode.vector_check.tensors import map_tree
 
 Tree = wp.array | np.ndarray | dict[str, "Tree"] | list["Tree"]
 """An array whose first axis is the world, or a dict or list of such trees."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from softmode.deformables.build.body_modes import surface_modes
+from softmode.deformables.reduction.body_modes import surface_modes
 from softmode.envs.reward_kernels import TOUCH_FORCE
 from softmode.envs.scripted_base import Environment, ScriptedPolicy, Vector, bounded
 from softmode.errors import GraspError

@@ -12,8 +12,8 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from softmode.deformables.build.build_body import Progress
 from softmode.deformables.model.status import status_reasons
+from softmode.deformables.reduction.build_body import Progress
 from softmode.envs.arguments import (
     RENDER_MODES,
     Shortcuts,
@@ -37,9 +37,9 @@ from softmode.envs.results import host_view, info_arrays, name_of, observation_a
 from softmode.envs.robots import Robot
 from softmode.envs.task import Task
 from softmode.envs.task_config import ObservationType, TaskConfig
-from softmode.envs.tensors import map_tree
 from softmode.errors import ConfigError
 from softmode.pause import collector_paused
+from softmode.vector_check.tensors import map_tree
 
 
 class SoftEnv(gym.Env, gym.utils.EzPickle):

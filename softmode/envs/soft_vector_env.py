@@ -17,7 +17,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
 from softmode.checks import require_choice
-from softmode.deformables.build.build_body import Progress
+from softmode.deformables.reduction.build_body import Progress
 from softmode.envs.arguments import (
     RENDER_MODES,
     Shortcuts,
@@ -35,9 +35,9 @@ from softmode.envs.results import add_object_names, named_reasons
 from softmode.envs.robots import Robot
 from softmode.envs.task import Task
 from softmode.envs.task_config import ObservationType, TaskConfig
-from softmode.envs.tensors import Tensor, host_array, map_tree
 from softmode.envs.worlds import LocalWorlds, RemoteWorlds
 from softmode.errors import ConfigError, MissingExtraError
+from softmode.vector_check.tensors import Tensor, host_array, map_tree
 
 Output = Literal["numpy", "torch"]
 

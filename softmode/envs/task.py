@@ -14,12 +14,12 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike, NDArray
 
 from softmode.deformables.body.rkpm import sample_farthest
-from softmode.deformables.build.build_body import Progress
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model import status as bits
 from softmode.deformables.model.compile_ahead import compile_launches, compiling_aside
 from softmode.deformables.model.structs import filled
-from softmode.deformables.solver.parameters import set_parameters
+from softmode.deformables.reduction.build_body import Progress
+from softmode.deformables.tools.parameters import set_parameters
 from softmode.envs import task_kernels as kernels
 from softmode.envs.cameras import FollowCamera, overview, square_camera, wrist_camera
 from softmode.envs.clutter import Arcs, clutter_parameters
@@ -42,8 +42,8 @@ from softmode.objects.soft_object import SoftObject
 from softmode.robots.jaws import ParallelJaw
 from softmode.scenes.capture import capture_graph
 from softmode.scenes.table_scene import GAP, TableScene, TableSceneConfig
-from softmode.splats.camera import CameraOptions
-from softmode.splats.pinhole import PinholeCamera
+from softmode.splats.cameras.camera import CameraOptions
+from softmode.splats.raster.pinhole import PinholeCamera
 from softmode.splats.splats import Splats
 
 FALL = 0.05

@@ -11,7 +11,7 @@ from softmode.checks import require_choice, require_number, require_numbers, req
 from softmode.errors import ConfigError
 from softmode.objects.object_set import ObjectSet
 from softmode.scenes.table_scene import TableSceneConfig
-from softmode.splats.camera_randomization import CameraRandomization
+from softmode.splats.cameras.camera_randomization import CameraRandomization
 
 ObservationType = Literal["state", "pixels", "pixels_agent_pos"]
 CameraName = Literal["front", "wrist"]

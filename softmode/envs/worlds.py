@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from softmode.envs.env_state import set_worlds_state, worlds_state
 from softmode.envs.results import host_view, info_arrays, observation_arrays, write
 from softmode.envs.task import Task
-from softmode.envs.tensors import map_tree
 from softmode.errors import SoftmodeError, WorkerError
 from softmode.pause import collector_paused
+from softmode.vector_check.tensors import map_tree
 
 ANSWERED = ("reset", "step", "set_state")
 """Calls whose answer is the result of all worlds."""

@@ -161,7 +161,7 @@ def particles_from_body(
     """
     made = material or Material()
     if spacing is None:
-        from softmode.deformables.build.sources import unpack_sources
+        from softmode.deformables.reduction.sources import unpack_sources
 
         sources = unpack_sources(body)
         if sources.density_scale is not None:
@@ -171,7 +171,7 @@ def particles_from_body(
             )
         points, volumes = sources.quadrature.points - body.offset, sources.quadrature.weights
         return ParticleBody(positions=points, masses=made.density * volumes, material=made)
-    from softmode.deformables.build.interior import winding_numbers
+    from softmode.deformables.quadrature.interior import winding_numbers
 
     return particles_from_shape(
         lambda points: winding_numbers(body, points) > 0.5,

@@ -13,7 +13,7 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from softmode.checks import require_number
-from softmode.deformables.build.static_response import lame_parameters
+from softmode.deformables.reduction.static_response import lame_parameters
 from softmode.errors import ConfigError, SolverDiverged
 from softmode.mpm.adjoint_kernels import grid_to_particles_adjoint, move_grid_adjoint, particles_to_grid_adjoint
 from softmode.mpm.grid import Grid

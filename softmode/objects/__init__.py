@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from softmode.objects.object_set import ObjectSet
     from softmode.objects.paint import StifferColor, color_field, nearest_field, read_field
     from softmode.objects.placed import Placed
-    from softmode.objects.presets import PRESETS, Preset
+    from softmode.objects.shapes.presets import PRESETS, Preset
     from softmode.objects.soft_object import SoftObject
     from softmode.objects.solids import Solid, filled, solid_names, solid_of
     from softmode.objects.task_objects import (

@@ -9,15 +9,15 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from softmode.checks import require_choice, require_fields, require_number
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.surface_samples import SURFACE_COUNT
 from softmode.deformables.materials.material import Material
+from softmode.deformables.quadrature.surface_samples import SURFACE_COUNT
+from softmode.deformables.reduction.options import BuildOptions
 from softmode.errors import AssetError, ConfigError
 from softmode.objects.fingerprint import file_fingerprint, find_file
 from softmode.objects.paint import StifferColor
 from softmode.objects.parts import Part
-from softmode.objects.presets import find_preset
-from softmode.objects.primitives import Color, Extents, find_axis
+from softmode.objects.shapes.presets import find_preset
+from softmode.objects.shapes.primitives import Color, Extents, find_axis
 from softmode.radiance.grid import RadianceGrid
 from softmode.splats.colored_mesh import ColoredMesh
 from softmode.splats.splats import Splats, UpAxis

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import log_ndtr
 
-from softmode.deformables.build.cut import Cut, cut_body
-from softmode.deformables.build.patch import Patch
+from softmode.deformables.reduction.cut import Cut, cut_body
+from softmode.deformables.reduction.patch import Patch
 from softmode.objects.object_file import stored_material
-from softmode.objects.primitives import Color
+from softmode.objects.shapes.primitives import Color
 from softmode.objects.soft_object import SoftObject
 from softmode.splats.point_cloud import splats_from_points
 from softmode.splats.splats import Splats, joined

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from softmode.deformables.body.reduced_body import ReducedBody
-from softmode.deformables.build.cache import cached_body
 from softmode.deformables.materials.material import Material, warn_of_units
+from softmode.deformables.reduction.cache import cached_body
 from softmode.objects.config import ObjectConfig
 from softmode.objects.object_file import file_kind, read_object, surface_cover
 from softmode.objects.pipeline import body_key, build_standing, dressed
-from softmode.objects.presets import PRESETS
+from softmode.objects.shapes.presets import PRESETS
 from softmode.objects.soft_object import SoftObject
 from softmode.objects.source import object_source
 from softmode.radiance.grid import RadianceGrid
@@ -45,7 +45,7 @@ def load(
             a mesh (also of trimesh) in memory; None for the built-in plush.
         material: What it is made of; None for what its file or preset says. The body is built for its Poisson's ratio,
             unless `BuildOptions` name one.
-        progress: Passed to :func:`softmode.deformables.build.build_body.build_body`.
+        progress: Passed to :func:`softmode.deformables.reduction.build_body.build_body`.
         options: Fields of `ObjectConfig`, such as ``size=0.08``; they replace those of a configuration. A body takes
             only ``contact_radius``.
 
@@ -94,9 +94,9 @@ def object_config(source: Source | str | os.PathLike[str] | None, **options: Any
         return source.changed(**options).located()
     if source is None:
         return ObjectConfig(**options)
-    if str(source) in PRESETS:
-        return ObjectConfig(preset=str(source), **options)
     if isinstance(source, str | os.PathLike):
+        if os.fspath(source) in PRESETS:
+            return ObjectConfig(preset=os.fspath(source), **options)
         kind = file_kind(source)
         return ObjectConfig(**{"splat" if kind == "points" else kind: Path(source)}, **options)
     if isinstance(source, Splats):

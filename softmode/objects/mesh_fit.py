@@ -10,9 +10,9 @@ import warp as wp
 
 from softmode.objects.mesh_file import read_mesh
 from softmode.splats.colored_mesh import ColoredMesh
+from softmode.splats.fit.picture_fit import FitOptions, fit_splats
+from softmode.splats.fit.reference_views import render_mesh
 from softmode.splats.mesh_samples import sample_mesh
-from softmode.splats.picture_fit import FitOptions, fit_splats
-from softmode.splats.reference_views import render_mesh
 from softmode.splats.splats import Splats
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ def splats_from_mesh(
     """Cover a mesh with splats and fit them to its pictures.
 
     Splats sampled on the surface (`sample_mesh`) are fitted to pictures of the unlit mesh from all around
-    (`softmode.splats.picture_fit.fit_splats`).
+    (`softmode.splats.fit.picture_fit.fit_splats`).
 
     Args:
         mesh: A file of any kind that trimesh reads, a trimesh mesh or scene, or a `ColoredMesh`.

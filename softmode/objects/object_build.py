@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from softmode.deformables.body.regions import Region
-from softmode.deformables.build.quadrature_grid import Quadrature
 from softmode.deformables.materials.material import Material
+from softmode.deformables.quadrature.quadrature_grid import Quadrature
 from softmode.objects.loader import Progress, object_config
 from softmode.objects.pipeline import build_standing, dressed
 from softmode.objects.soft_object import SoftObject
@@ -36,7 +36,7 @@ def build_object(
         source: Which object, as for `load`; not a body.
         regions: Parts that a scene holds, moves or grasps.
         material: What the object is made of, as for `load`.
-        progress: Passed to :func:`softmode.deformables.build.build_body.build_body`.
+        progress: Passed to :func:`softmode.deformables.reduction.build_body.build_body`.
         options: Fields of `ObjectConfig`, such as ``size=0.08``.
 
     Returns:

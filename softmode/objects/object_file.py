@@ -16,7 +16,7 @@ from softmode.deformables.materials.material import Material
 from softmode.errors import AssetError
 from softmode.files import array_names, damage_errors
 from softmode.foreign import tokens
-from softmode.objects.presets import PRESETS
+from softmode.objects.shapes.presets import PRESETS
 from softmode.objects.soft_object import SoftObject
 from softmode.radiance.formats import is_radiance
 from softmode.radiance.grid import RadianceGrid

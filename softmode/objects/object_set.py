@@ -17,7 +17,7 @@ from softmode.errors import ConfigError
 from softmode.foreign import tokens
 from softmode.objects.config import FILES, ObjectConfig
 from softmode.objects.object_file import file_kind
-from softmode.objects.presets import PRESETS
+from softmode.objects.shapes.presets import PRESETS
 from softmode.radiance.formats import SUFFIXES as RADIANCE
 from softmode.splats.formats import READABLE
 

@@ -18,7 +18,7 @@ from scipy.spatial import KDTree
 from softmode.checks import require_number
 from softmode.errors import AssetError, ConfigError, MaterialError
 from softmode.files import UNPACKED_FREE, damage_errors, read_arrays
-from softmode.objects.primitives import Color
+from softmode.objects.shapes.primitives import Color
 from softmode.splats.point_cloud import distinct
 from softmode.splats.splats import Splats
 

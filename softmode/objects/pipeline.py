@@ -16,16 +16,16 @@ from numpy.typing import NDArray
 
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.body.regions import Region
-from softmode.deformables.build.build_body import Progress, build_body
-from softmode.deformables.build.quadrature_grid import Quadrature
-from softmode.deformables.build.surface_samples import SURFACE_COUNT
 from softmode.deformables.materials.material import Material
+from softmode.deformables.quadrature.quadrature_grid import Quadrature
+from softmode.deformables.quadrature.surface_samples import SURFACE_COUNT
+from softmode.deformables.reduction.build_body import Progress, build_body
 from softmode.errors import AssetError, ConfigError
 from softmode.objects.config import FIELD_FILES, FILES, ObjectConfig
 from softmode.objects.paint import color_field, read_field
 from softmode.objects.pose import seat_of, stable_rotation
-from softmode.objects.presets import find_preset
-from softmode.objects.primitives import scaled, turned
+from softmode.objects.shapes.presets import find_preset
+from softmode.objects.shapes.primitives import scaled, turned
 from softmode.objects.soft_object import SoftObject
 from softmode.objects.source import ObjectSource
 from softmode.splats.splats import Splats
@@ -133,7 +133,7 @@ def build_standing(
         config: Which object.
         source: What it is made of.
         regions: Parts that a scene holds, moves or grasps, beside the foot of a clamped object, where it stands.
-        progress: Passed to :func:`softmode.deformables.build.build_body.build_body`.
+        progress: Passed to :func:`softmode.deformables.reduction.build_body.build_body`.
 
     Returns:
         The body, whose `provenance` tells how it was laid down ("turn") and where it stands ("seat"), and its solid.

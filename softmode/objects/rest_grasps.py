@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from softmode.deformables.body.reduced_body import ReducedBody
-from softmode.deformables.build.body_modes import surface_modes
 from softmode.deformables.materials.material import Material
+from softmode.deformables.reduction.body_modes import surface_modes
 from softmode.robots.grasp_planner import Grasp, plan_grasps
 from softmode.robots.jaws import ParallelJaw
 

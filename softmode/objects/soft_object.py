@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softmode.deformables.body.reduced_body import FORMAT_VERSION, ReducedBody
-from softmode.deformables.build.cache import cached
-from softmode.deformables.build.report import Finding, object_findings
 from softmode.deformables.contact.dents import DentWeights, dent_weights
 from softmode.deformables.materials.material import Material
+from softmode.deformables.reduction.cache import cached
+from softmode.deformables.reduction.report import Finding, object_findings
 from softmode.deformables.skinning.skin_splats import average_basis
 from softmode.errors import ConfigError, GraspError
 from softmode.files import read_archive, write_archive

@@ -16,14 +16,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
-from softmode.deformables.build.interior import winding_numbers
 from softmode.deformables.materials.material import Material
+from softmode.deformables.quadrature.interior import winding_numbers
 from softmode.errors import AssetError, needs_extra
 from softmode.mpm import MORPH_MATERIAL, ParticleBody, particles_from_shape
 from softmode.objects.config import ObjectConfig
 from softmode.objects.object_file import file_kind
 from softmode.objects.pipeline import standing_quadrature
-from softmode.objects.primitives import KEY_LIGHT, Color, checker
+from softmode.objects.shapes.primitives import KEY_LIGHT, Color, checker
 from softmode.objects.source import DEFAULT_COLORS, object_source
 from softmode.splats.mesh_samples import eliminate_samples
 from softmode.splats.point_cloud import splats_from_points

@@ -11,11 +11,11 @@ from typing import Any, get_args
 
 import numpy as np
 
-from softmode.deformables.build.cache import cached
-from softmode.deformables.build.quadrature import quadrature_from_splats
-from softmode.deformables.build.quadrature_density import quadrature_from_density
-from softmode.deformables.build.quadrature_grid import Quadrature
-from softmode.deformables.build.quadrature_mesh import cap_holes, quadrature_from_mesh
+from softmode.deformables.quadrature.quadrature import quadrature_from_splats
+from softmode.deformables.quadrature.quadrature_density import quadrature_from_density
+from softmode.deformables.quadrature.quadrature_grid import Quadrature
+from softmode.deformables.quadrature.quadrature_mesh import cap_holes, quadrature_from_mesh
+from softmode.deformables.reduction.cache import cached
 from softmode.errors import AssetError, ConfigError
 from softmode.files import read_archive, write_archive
 from softmode.foreign import tokens
@@ -23,8 +23,8 @@ from softmode.objects.config import ObjectConfig
 from softmode.objects.mesh_file import read_mesh
 from softmode.objects.parts import choose_part
 from softmode.objects.pose import seat_of
-from softmode.objects.presets import preset_mesh
-from softmode.objects.primitives import (
+from softmode.objects.shapes.presets import preset_mesh
+from softmode.objects.shapes.primitives import (
     Color,
     Extents,
     Primitive,

@@ -13,9 +13,9 @@ from softmode.files import damage_errors
 from softmode.foreign import process
 from softmode.foreign.child.surface import near_zero
 from softmode.objects.soft_object import SoftObject
-from softmode.objects.stage_bundle import body_of
-from softmode.objects.stage_geometry import SurfaceMesh, mesh_surface, tet_surface
-from softmode.objects.stage_scene import parts_of, read_usd_scene, stage_frame, warned
+from softmode.objects.stage.bundle import body_of
+from softmode.objects.stage.geometry import SurfaceMesh, mesh_surface, tet_surface
+from softmode.objects.stage.scene import parts_of, read_usd_scene, stage_frame, warned
 from softmode.splats.colored_mesh import ColoredMesh
 
 

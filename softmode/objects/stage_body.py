@@ -7,22 +7,22 @@ from typing import Any
 import numpy as np
 
 from softmode.deformables.body.reduced_body import ReducedBody
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.cache import cached_body
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_points, quadrature_from_splats
-from softmode.deformables.build.quadrature_grid import Quadrature
-from softmode.deformables.build.quadrature_mesh import cap_holes, quadrature_from_mesh
-from softmode.deformables.build.surface_samples import SURFACE_COUNT
 from softmode.deformables.materials.material import Material, warn_of_units
 from softmode.deformables.model.authoring import SCALE_MAX, SCALE_MIN
+from softmode.deformables.quadrature.quadrature import quadrature_from_points, quadrature_from_splats
+from softmode.deformables.quadrature.quadrature_grid import Quadrature
+from softmode.deformables.quadrature.quadrature_mesh import cap_holes, quadrature_from_mesh
+from softmode.deformables.quadrature.surface_samples import SURFACE_COUNT
+from softmode.deformables.reduction.build_body import build_body
+from softmode.deformables.reduction.cache import cached_body
+from softmode.deformables.reduction.options import BuildOptions
 from softmode.errors import AssetError, BasisError
 from softmode.objects.loader import Progress
 from softmode.objects.placed import Placed
 from softmode.objects.soft_object import SoftObject
+from softmode.objects.stage.bundle import body_of
+from softmode.objects.stage.scene import UsdDeformable
 from softmode.objects.stage_asset import colored_mesh
-from softmode.objects.stage_bundle import body_of
-from softmode.objects.stage_scene import UsdDeformable
 from softmode.splats.mesh_samples import sample_mesh
 from softmode.splats.splats import Splats
 
@@ -54,7 +54,7 @@ def place_deformable(
         surface_count: Number of surface samples.
         splat_count: Number of splats on a body that the stage shows by meshes.
         contact_radius: How far the surface that touches stands out from the body's [m].
-        progress: Passed to :func:`softmode.deformables.build.build_body.build_body`.
+        progress: Passed to :func:`softmode.deformables.reduction.build_body.build_body`.
 
     Raises:
         AssetError: If it encloses no volume, or is a body of softmode scaled outside 0.25..4.
@@ -111,7 +111,7 @@ def build_deformable(
         deformable: From `read_usd_scene`.
         options: How it is reduced; defaults when None.
         surface_count: Number of surface samples.
-        progress: Passed to :func:`softmode.deformables.build.build_body.build_body`.
+        progress: Passed to :func:`softmode.deformables.reduction.build_body.build_body`.
 
     Returns:
         The body, named after its prim.

@@ -4,8 +4,8 @@ Few functions, points and samples each, for training; `docs/objects.md` has what
 are chosen by elastic energy, at the Poisson's ratio of the material.
 """
 
-from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.materials.material import Material
+from softmode.deformables.reduction.options import BuildOptions
 from softmode.objects.config import ObjectConfig
 
 BEAM = ObjectConfig(

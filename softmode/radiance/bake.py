@@ -15,7 +15,7 @@ from scipy import ndimage
 from softmode.checks import require_number
 from softmode.radiance.grid import RadianceGrid
 from softmode.radiance.march import render_radiance
-from softmode.splats.picture_fit import FitOptions, fit_splats
+from softmode.splats.fit.picture_fit import FitOptions, fit_splats
 from softmode.splats.principal_axes import axes_of_covariances
 from softmode.splats.splats import Splats, quats_from_rotations, rotate_sh
 

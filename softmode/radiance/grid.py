@@ -53,11 +53,7 @@ class RadianceGrid:
     def __post_init__(self) -> None:
         """Convert, validate and freeze the arrays."""
         density = self._numbers("density", self.density)
-        if density.ndim != 3 or min(density.shape) < 2:
-            raise AssetError(
-                f"{self.name}: density has shape {density.shape}, expected (nx, ny, nz) of at least 2 nodes each",
-                hint="give numbers on the nodes of a box",
-            )
+        _require_nodes(self.name, density.shape)
         shape = np.shape(self.sh)
         if len(shape) != 5 or shape[:3] != density.shape or shape[3:] not in ((1, 3), (4, 3), (9, 3)):
             raise AssetError(
@@ -104,11 +100,8 @@ class RadianceGrid:
         cls, density: ArrayLike, sh: ArrayLike, bounds: ArrayLike, *, name: str = "radiance field"
     ) -> RadianceGrid:
         """Return the field whose first and last node lie at the corners of a box [m], shape (2, 3)."""
-        box, shape = np.array(bounds, dtype=np.float64), np.shape(density)
-        if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[1] > box[0]).all():
-            raise AssetError(f"{name}: bounds are no corners (2, 3) with upper > lower", hint="give metres")
-        if len(shape) != 3 or min(shape) < 2:
-            raise AssetError(f"{name}: density has shape {shape}, expected (nx, ny, nz) of at least 2 nodes each")
+        box, shape = _corners(name, bounds), np.shape(density)
+        _require_nodes(name, shape)
         return cls(density=np.asarray(density), sh=np.asarray(sh), origin=box[0],
                    axes=np.diag((box[1] - box[0]) / (np.array(shape) - 1)), name=name)  # fmt: skip
 
@@ -130,9 +123,7 @@ class RadianceGrid:
             ConfigError: If the resolution is out of range.
         """
         require_number("resolution", resolution, at_least=8, at_most=512)
-        box = np.array(bounds, dtype=np.float64)
-        if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[1] > box[0]).all():
-            raise AssetError(f"{name}: bounds are no corners (2, 3) with upper > lower", hint="give metres")
+        box = _corners(name, bounds)
         edge = float((box[1] - box[0]).max()) / (resolution - 1)
         shape = np.maximum(np.round((box[1] - box[0]) / edge).astype(int) + 1, 2)
         axes = [np.linspace(box[0, d], box[1, d], shape[d]) for d in range(3)]
@@ -300,6 +291,23 @@ class RadianceGrid:
         seen = np.asarray(directions, dtype=np.float64) @ self.rotation
         basis = sh_basis(seen, self.sh.shape[3])
         return np.clip(0.5 + np.einsum("nk,nkc->nc", basis, self.coefficients(points)), 0.0, 1.0)
+
+
+def _require_nodes(name: str, shape: tuple[int, ...]) -> None:
+    """Refuse a density that is on no grid."""
+    if len(shape) != 3 or min(shape) < 2:
+        raise AssetError(
+            f"{name}: density has shape {shape}, expected (nx, ny, nz) of at least 2 nodes each",
+            hint="give numbers on the nodes of a box",
+        )
+
+
+def _corners(name: str, bounds: ArrayLike) -> Array:
+    """Return the corners of a box [m], shape (2, 3), or refuse what are none."""
+    box = np.array(bounds, dtype=np.float64)
+    if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[1] > box[0]).all():
+        raise AssetError(f"{name}: bounds are no corners (2, 3) with upper > lower", hint="give metres")
+    return box
 
 
 def sh_of_colors(colors: ArrayLike) -> Array:

@@ -18,8 +18,8 @@ from softmode.deformables.tools.inverse_map import InverseMap
 from softmode.errors import ConfigError
 from softmode.radiance import march_kernels as kernels
 from softmode.radiance.grid import RadianceGrid
-from softmode.splats.rasterizer import ViewArrays
-from softmode.splats.reference_views import ReferenceViews
+from softmode.splats.fit.reference_views import ReferenceViews
+from softmode.splats.raster.rasterizer import ViewArrays
 
 
 @dataclass(frozen=True, kw_only=True)

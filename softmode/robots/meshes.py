@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-from softmode.deformables.build.cache import cache_directory, fingerprint_of, is_trusted, writable_cache
+from softmode.deformables.reduction.cache import cache_directory, fingerprint_of, is_trusted, writable_cache
 from softmode.errors import AssetError, MissingExtraError, needs_extra
 from softmode.files import damage_errors, whole_file
 from softmode.foreign import process

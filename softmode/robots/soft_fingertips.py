@@ -12,11 +12,11 @@ import warp as wp
 
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.body.regions import Region
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_capsule
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body
+from softmode.deformables.quadrature.quadrature import quadrature_from_capsule
+from softmode.deformables.reduction.build_body import build_body
+from softmode.deformables.reduction.options import BuildOptions
 from softmode.deformables.solver.attachments import Attachment, attach
 from softmode.robots.arm import ArmIndices
 

@@ -25,8 +25,8 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from softmode.deformables.build.cache import cache_directory, fingerprint_of, is_trusted, writable_cache
 from softmode.deformables.coupling.rigid_solver import mujoco_warnings
+from softmode.deformables.reduction.cache import cache_directory, fingerprint_of, is_trusted, writable_cache
 from softmode.errors import AssetError, SoftmodeError, needs_extra
 from softmode.files import whole_file
 from softmode.foreign import process

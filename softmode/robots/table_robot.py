@@ -425,16 +425,18 @@ def _reach(
         q, error = chain.inverse(local[rows], turns[rows], begin, iterations=80)
         return q, np.where(chain.lowest(q) + base[rows, 2] < 0.0, np.inf, error)
 
+    def ranked(q: Array, error: Array) -> Array:
+        """Return the error, larger where a pose to begin with is at the end of a joint's range: the last choice."""
+        return error + _NEAR * (np.minimum(q - low, high - q).min(axis=1) < _ROOM) if bent else error
+
     q, error = solved(np.arange(len(points)), start)
     for other in starts:
-        # Where a pose is chosen to begin with, one at the end of a joint's range serves only if there is no other.
-        tight = error + _NEAR * (np.minimum(q - low, high - q).min(axis=1) < _ROOM) if bent else error
-        left = np.flatnonzero(tight > _NEAR)
+        rank = ranked(q, error)
+        left = np.flatnonzero(rank > _NEAR)
         if not len(left):
             break
         again, missing = solved(left, other)
-        more = missing + _NEAR * (np.minimum(again - low, high - again).min(axis=1) < _ROOM) if bent else missing
-        better = more < tight[left]
+        better = ranked(again, missing) < rank[left]
         q[left[better]], error[left[better]] = again[better], missing[better]
     return q, error
 

@@ -16,13 +16,13 @@ from softmode.deformables.model.declare import launch
 from softmode.deformables.model.namespaces import soft
 from softmode.deformables.skinning.skin_splats import SkinSplats
 from softmode.deformables.skinning.skinning_kernels import vec6
-from softmode.deformables.solver import body_choice_kernels as kernels
-from softmode.deformables.solver.body_choice import copy_slots
+from softmode.deformables.tools import body_choice_kernels as kernels
+from softmode.deformables.tools.body_choice import copy_slots
 from softmode.errors import ConfigError
 from softmode.objects.soft_object import SoftObject
 from softmode.scenes.host import host
 from softmode.scenes.splat_axes_kernels import principal_axes
-from softmode.splats.rasterizer import SplatArrays, spanning_columns
+from softmode.splats.raster.rasterizer import SplatArrays, spanning_columns
 from softmode.splats.splats import Splats
 
 _ARRAYS = ("means", "covariances", "opacities", "sh", "rotations", "spanning")

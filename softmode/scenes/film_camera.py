@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from softmode.scenes.host import host
 from softmode.scenes.meshes import SceneMesh, scene_meshes, scene_poses
-from softmode.splats.camera_options import CameraOptions
-from softmode.splats.mesh_raster import MeshRaster, TriangleMeshes
-from softmode.splats.pinhole import PinholeCamera
-from softmode.splats.rasterizer import RasterizerOptions, SplatArrays, SplatRasterizer, ViewArrays
+from softmode.splats.cameras.camera_options import CameraOptions
+from softmode.splats.cameras.mesh_raster import MeshRaster, TriangleMeshes
+from softmode.splats.raster.pinhole import PinholeCamera
+from softmode.splats.raster.rasterizer import RasterizerOptions, SplatArrays, SplatRasterizer, ViewArrays
 from softmode.splats.splats import Splats, rotations_from_quats
 
 SEGMENTS = 48

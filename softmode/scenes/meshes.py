@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from softmode.checks import require_number
 from softmode.scenes.host import host
-from softmode.splats.shape_triangles import shape_triangles
+from softmode.splats.cameras.shape_triangles import shape_triangles
 from softmode.splats.splats import rotations_from_quats
 
 PLANE_EXTENT = 4.0

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softmode.deformables.body.reduced_body import ReducedBody
-from softmode.deformables.build.hold import carry_over
 from softmode.deformables.model.namespaces import soft
-from softmode.deformables.solver.energies import SoftEnergies
+from softmode.deformables.reduction.hold import carry_over
+from softmode.deformables.tools.energies import SoftEnergies
 from softmode.scenes.scene import Scene
 
 Array = NDArray[np.float64]

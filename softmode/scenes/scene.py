@@ -7,13 +7,13 @@ from typing import Protocol
 
 import newton
 
-from softmode.deformables.solver.reduced_solver import ReducedSolver
+from softmode.deformables.solver.solver_base import ReducedSolver
 from softmode.deformables.tools.grips import Grips
 from softmode.objects.soft_object import SoftObject
 from softmode.scenes.binding import BoundSplats
-from softmode.splats.camera import CameraOptions, Overlay, SplatCamera
-from softmode.splats.camera_randomization import CameraRandomization
-from softmode.splats.pinhole import PinholeCamera
+from softmode.splats.cameras.camera import CameraOptions, Overlay, SplatCamera
+from softmode.splats.cameras.camera_randomization import CameraRandomization
+from softmode.splats.raster.pinhole import PinholeCamera
 
 
 class Scene(Protocol):
@@ -61,7 +61,7 @@ def cameras_by_size(
     randomization: CameraRandomization | None = None,
     overlay: Overlay | None = None,
 ) -> dict[tuple[int, int], SplatCamera]:
-    """Return one :class:`softmode.splats.camera.SplatCamera` per image size; they share the splats.
+    """Return one :class:`softmode.splats.cameras.camera.SplatCamera` per image size; they share the splats.
 
     Args:
         model: The model.

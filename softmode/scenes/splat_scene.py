@@ -33,8 +33,8 @@ from softmode.scenes.capture import capture_graph, capture_step, require_even
 from softmode.scenes.fixture import Fixture, add_fixture
 from softmode.scenes.recording import Recording
 from softmode.scenes.scene import cameras_by_size
-from softmode.splats.camera import CameraOptions, SplatCamera
-from softmode.splats.pinhole import PinholeCamera
+from softmode.splats.cameras.camera import CameraOptions, SplatCamera
+from softmode.splats.raster.pinhole import PinholeCamera
 
 
 @cache

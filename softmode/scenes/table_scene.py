@@ -18,8 +18,8 @@ from softmode.deformables.model.authoring import register_custom_attributes, res
 from softmode.deformables.model.compile_ahead import begin_compiling, compile_for_building, compiling_aside
 from softmode.deformables.model.declare import launch
 from softmode.deformables.model.status import status_reasons
-from softmode.deformables.solver.body_choice import BodyChoice, copy_slots
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
+from softmode.deformables.tools.body_choice import BodyChoice, copy_slots
 from softmode.deformables.tools.grips import GripOptions, Grips, add_grip_slots
 from softmode.errors import ConfigError
 from softmode.objects.config import ObjectConfig
@@ -40,9 +40,9 @@ from softmode.scenes.film_camera import FilmCamera, columns_of
 from softmode.scenes.fixture import Fixture, add_fixture
 from softmode.scenes.recording import Recording
 from softmode.scenes.scene import cameras_by_size
-from softmode.splats.camera import CameraOptions, SplatCamera
-from softmode.splats.camera_randomization import CameraRandomization
-from softmode.splats.pinhole import PinholeCamera
+from softmode.splats.cameras.camera import CameraOptions, SplatCamera
+from softmode.splats.cameras.camera_randomization import CameraRandomization
+from softmode.splats.raster.pinhole import PinholeCamera
 from softmode.splats.splats import Splats
 
 GAP = 2.0e-4
@@ -115,7 +115,7 @@ class TableScene:
         marker: Splats around the origin that mark a place, such as a goal, in pictures; they touch nothing. A list of
             them has those of each world, or of each object of the set where a reset may change the object.
         device: Warp device; the default one if None.
-        progress: Reports the build of the object, see :func:`softmode.deformables.build.build_body.build_body`.
+        progress: Reports the build of the object, see :func:`softmode.deformables.reduction.build_body.build_body`.
     """
 
     def __init__(

@@ -10,21 +10,21 @@ from typing import TYPE_CHECKING
 from softmode.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from softmode.splats.camera import SplatCamera
-    from softmode.splats.camera_options import CameraOptions, ShadowOptions
-    from softmode.splats.camera_randomization import CameraRandomization, ViewVariation
+    from softmode.splats.cameras.camera import SplatCamera
+    from softmode.splats.cameras.camera_options import CameraOptions, ShadowOptions
+    from softmode.splats.cameras.camera_randomization import CameraRandomization, ViewVariation
+    from softmode.splats.cameras.rigid_splats import RigidSplats, RigidSplatsSkin
     from softmode.splats.colored_mesh import ColoredMesh
     from softmode.splats.components import split_components
+    from softmode.splats.fit.reference_views import orbit_poses, render_mesh
     from softmode.splats.formats import CONVENTIONS, READABLE, WRITABLE, read_splats, write_ply, write_splats, write_usd
     from softmode.splats.mesh_samples import sample_mesh
-    from softmode.splats.pinhole import PinholeCamera
     from softmode.splats.plush import make_plush, plush_bounds, plush_signed_distance
     from softmode.splats.point_cloud import splats_from_points
-    from softmode.splats.rasterizer import RasterizerOptions, SplatArrays, SplatRasterizer, ViewArrays
-    from softmode.splats.rasterizer_adjoint import AdjointRasterizer, RasterizerGradients
-    from softmode.splats.rasterizer_torch import render
-    from softmode.splats.reference_views import orbit_poses, render_mesh
-    from softmode.splats.rigid_splats import RigidSplats, RigidSplatsSkin
+    from softmode.splats.raster.pinhole import PinholeCamera
+    from softmode.splats.raster.rasterizer import RasterizerOptions, SplatArrays, SplatRasterizer, ViewArrays
+    from softmode.splats.raster.rasterizer_adjoint import AdjointRasterizer, RasterizerGradients
+    from softmode.splats.raster.rasterizer_torch import render
     from softmode.splats.splats import Splats, up_rotation
 
 __all__ = [

@@ -11,14 +11,14 @@ import gymnasium as gym
 
 from softmode.checks import require_number
 from softmode.envs.catalogue import env_class, registered_id
-from softmode.envs.check import check_vector_env
-from softmode.envs.check.values import equal
 from softmode.envs.scripted import scripted_policy
-from softmode.envs.tensors import world_of
 from softmode.errors import ConfigError, EnvironmentCheckError
 from softmode.learning.intervals import wilson_interval
 from softmode.testing.assertions import assert_replays
 from softmode.testing.episode import play_episode, soft_base
+from softmode.vector_check import check_vector_env
+from softmode.vector_check.tensors import world_of
+from softmode.vector_check.values import equal
 
 _STEPS = 20
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from softmode.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from softmode.objects.stage_scene import UsdDeformable, UsdScene, read_usd_scene
+    from softmode.objects.stage.scene import UsdDeformable, UsdScene, read_usd_scene
     from softmode.usd.animation import UsdAnimation, UsdAnimationOptions
     from softmode.usd.importer import UsdImport, add_usd
     from softmode.usd.playback import PlayedBody, UsdPlayback, read_animation

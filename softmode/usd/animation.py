@@ -24,10 +24,10 @@ from softmode.errors import ConfigError, SolverDiverged
 from softmode.foreign import tokens
 from softmode.foreign.openusd import Layer, Stage
 from softmode.objects.placed import Placed
-from softmode.objects.stage_scene import shortest
+from softmode.objects.stage.scene import shortest
 from softmode.scenes.binding import splats_of_states
 from softmode.splats.formats.usd import set_splat_column, splat_columns
-from softmode.splats.pinhole import PinholeCamera
+from softmode.splats.raster.pinhole import PinholeCamera
 from softmode.usd.dents import Dents
 from softmode.usd.handles import handles_from_coordinates, local_coordinates, rigid_motion
 from softmode.usd.openusd import check_stage, openusd, whole_stage

@@ -14,15 +14,15 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from softmode.deformables.body.reduced_body import ReducedBody
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.surface_samples import SURFACE_COUNT
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import rotation_matrix
+from softmode.deformables.quadrature.surface_samples import SURFACE_COUNT
+from softmode.deformables.reduction.options import BuildOptions
 from softmode.errors import AssetError, ConfigError, SoftmodeError
 from softmode.objects.loader import Progress
 from softmode.objects.placed import Placed
+from softmode.objects.stage.scene import UsdScene, open_scene
 from softmode.objects.stage_body import place_deformable
-from softmode.objects.stage_scene import UsdScene, open_scene
 from softmode.splats.splats import quats_from_rotations
 
 Array = NDArray[np.float64]
@@ -88,7 +88,7 @@ def add_usd(
         splat_count: Number of splats on a body that the stage shows by meshes.
         contact_radius: How far the surface that touches stands out from the body's [m].
         newton_options: Arguments for `newton.ModelBuilder.add_usd`, such as ``{"floating": False}``.
-        progress: Passed to :func:`softmode.deformables.build.build_body.build_body`.
+        progress: Passed to :func:`softmode.deformables.reduction.build_body.build_body`.
 
     Returns:
         The soft bodies by prim path and what Newton's importer says of the rest.

@@ -13,7 +13,7 @@ from softmode.errors import AssetError, ConfigError
 from softmode.files import REEXPORT, damage_errors
 from softmode.foreign import process
 from softmode.objects.soft_object import SoftObject
-from softmode.objects.stage_bundle import body_of
+from softmode.objects.stage.bundle import body_of
 from softmode.scenes.binding import splats_of_states
 from softmode.splats.formats.usd import splats_from_prim
 from softmode.splats.splats import MAX_SPLATS, Splats

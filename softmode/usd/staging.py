@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softmode.foreign.openusd import Stage
-from softmode.splats.pinhole import PinholeCamera
+from softmode.splats.raster.pinhole import PinholeCamera
 from softmode.splats.splats import rotations_from_quats
 from softmode.usd.openusd import openusd
 from softmode.usd.writer import prim_name, set_place

@@ -28,7 +28,7 @@ from softmode.errors import ConfigError
 from softmode.foreign import tokens
 from softmode.foreign.openusd import Layer, Prim, Stage, Value
 from softmode.objects.placed import Placed
-from softmode.objects.stage_bundle import DTYPES, encode_body
+from softmode.objects.stage.bundle import DTYPES, encode_body
 from softmode.splats.formats.usd import define_splats, set_splat_column, splat_columns
 from softmode.splats.splats import quats_from_rotations
 from softmode.usd import kaolin

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from softmode.checks import require_number
-from softmode.deformables.build.patch import Patch
+from softmode.deformables.reduction.patch import Patch
 from softmode.errors import ConfigError, SoftmodeError, needs_extra
 from softmode.files import free_name
 from softmode.view.live_types import Hit, Vector

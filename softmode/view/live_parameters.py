@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from softmode.checks import require_number
 from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
 from softmode.deformables.model.namespaces import soft
-from softmode.deformables.solver.parameters import PARAMETER_LIMITS, set_parameters
+from softmode.deformables.tools.parameters import PARAMETER_LIMITS, set_parameters
 from softmode.errors import ConfigError
 from softmode.scenes.host import host
 from softmode.scenes.scene import Scene

@@ -26,7 +26,7 @@ from softmode.objects.soft_object import SoftObject
 from softmode.scenes.fixture import Fixture
 from softmode.scenes.splat_scene import SplatScene
 from softmode.scenes.table_scene import TableScene
-from softmode.splats.pinhole import PinholeCamera
+from softmode.splats.raster.pinhole import PinholeCamera
 from softmode.splats.splats import Splats
 from softmode.view.live_types import HoldName, LiveOptions, SceneName, Vector
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softmode.mpm import MorphRun
-from softmode.objects.primitives import checker
+from softmode.objects.shapes.primitives import checker
 from softmode.objects.source import DEFAULT_COLORS
 from softmode.view.app import ViewOptions
 from softmode.view.page import Page

@@ -17,8 +17,8 @@ from softmode.files import PendingFile
 from softmode.objects.soft_object import SoftObject
 from softmode.scenes.host import host
 from softmode.scenes.scene import Scene
-from softmode.splats.camera import CameraOptions, SplatCamera
-from softmode.splats.pinhole import PinholeCamera
+from softmode.splats.cameras.camera import CameraOptions, SplatCamera
+from softmode.splats.raster.pinhole import PinholeCamera
 from softmode.view.live_recording import LiveRecording
 from softmode.view.live_types import finite_vector
 from softmode.view.picture import LivePicture

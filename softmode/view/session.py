@@ -19,13 +19,13 @@ from scipy.spatial import KDTree
 
 from softmode.checks import require_number
 from softmode.deformables.body.reduced_body import ReducedBody
-from softmode.deformables.build.hold import hold, paint
-from softmode.deformables.build.patch import Patch
-from softmode.deformables.build.sources import unpack_sources
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.namespaces import soft
 from softmode.deformables.model.status import status_reasons
-from softmode.deformables.solver.energies import SoftEnergies
+from softmode.deformables.reduction.hold import hold, paint
+from softmode.deformables.reduction.patch import Patch
+from softmode.deformables.reduction.sources import unpack_sources
+from softmode.deformables.tools.energies import SoftEnergies
 from softmode.deformables.tools.grips import Grip
 from softmode.errors import ConfigError, SoftmodeError
 from softmode.objects.config import ObjectConfig
@@ -36,7 +36,7 @@ from softmode.objects.soft_object import SoftObject
 from softmode.scenes.host import host
 from softmode.scenes.meshes import SceneMesh, scene_meshes
 from softmode.scenes.motion import coordinates, motion_of, set_motion
-from softmode.splats.pinhole import PinholeCamera
+from softmode.splats.raster.pinhole import PinholeCamera
 from softmode.view import live_parameters
 from softmode.view.hands import Hands
 from softmode.view.live_recording import LiveRecording

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from softmode.deformables.build.options import FUNCTION_LEAST, FUNCTION_LIMIT, BuildOptions
+from softmode.deformables.reduction.options import FUNCTION_LEAST, FUNCTION_LIMIT, BuildOptions
 from softmode.errors import ConfigError
 from softmode.foreign import tokens
 from softmode.objects.config import ObjectConfig
@@ -15,8 +15,8 @@ from softmode.objects.loader import Progress, load, object_config
 from softmode.objects.object_file import surface_cover
 from softmode.objects.placed import Placed
 from softmode.objects.soft_object import SoftObject
+from softmode.objects.stage.scene import read_usd_scene
 from softmode.objects.stage_body import place_deformable
-from softmode.objects.stage_scene import read_usd_scene
 
 
 def load_source(

@@ -14,8 +14,8 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from softmode.deformables.body.reduced_body import ReducedBody
-from softmode.deformables.build.body_modes import soft_modes
-from softmode.deformables.build.report import BodyReport
+from softmode.deformables.reduction.body_modes import soft_modes
+from softmode.deformables.reduction.report import BodyReport
 from softmode.errors import ConfigError, GraspError, needs_extra
 from softmode.files import whole_file
 from softmode.objects.rest_grasps import rest_grasps
@@ -193,8 +193,8 @@ def _painted(body: ReducedBody, splats: Splats, colors: Array) -> Splats:
 
 def _render(body: ReducedBody, shown: list[Splats]) -> list[NDArray[np.uint8]]:
     """Draw every set of splats from the same side."""
-    from softmode.splats.pinhole import PinholeCamera
-    from softmode.splats.rasterizer import SplatArrays, SplatRasterizer, ViewArrays
+    from softmode.splats.raster.pinhole import PinholeCamera
+    from softmode.splats.raster.rasterizer import SplatArrays, SplatRasterizer, ViewArrays
 
     right, up = _camera_axes()
     seen = np.concatenate([s.means for s in shown]) @ np.column_stack([right, up])

@@ -14,8 +14,8 @@ from scipy.spatial import KDTree
 from softmode.mpm import MorphOptions, MorphRun, ParticleBody, ReplayFrame, replay
 from softmode.objects.solids import Solid
 from softmode.scenes.film_camera import FilmCamera
-from softmode.splats.pinhole import PinholeCamera
-from softmode.splats.rasterizer import SplatArrays
+from softmode.splats.raster.pinhole import PinholeCamera
+from softmode.splats.raster.rasterizer import SplatArrays
 from softmode.splats.splats import Splats
 from softmode.viz.film import Film
 from softmode.viz.morph_film_kernels import ride

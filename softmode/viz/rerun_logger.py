@@ -11,13 +11,13 @@ import newton
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.deformables.solver.energies import SoftEnergies
+from softmode.deformables.tools.energies import SoftEnergies
 from softmode.deformables.tools.sensing import ContactSensor
 from softmode.errors import ConfigError
 from softmode.scenes.binding import BoundSplats, SplatFrame
 from softmode.scenes.host import host
 from softmode.scenes.meshes import distinct, scene_meshes, scene_poses
-from softmode.splats.camera import SplatCamera
+from softmode.splats.cameras.camera import SplatCamera
 from softmode.splats.splats import Splats
 from softmode.viz.rerun_blueprint import make_blueprint
 from softmode.viz.rerun_options import RerunOptions

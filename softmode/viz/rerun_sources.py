@@ -12,12 +12,12 @@ import numpy as np
 import warp as wp
 
 from softmode.deformables.model.status import status_reasons
-from softmode.deformables.solver.reduced_solver import ReducedSolver
+from softmode.deformables.solver.solver_base import ReducedSolver
 from softmode.errors import ConfigError
 from softmode.objects.soft_object import SoftObject
 from softmode.scenes.splat_scene import SplatScene
 from softmode.scenes.table_scene import TableScene
-from softmode.splats.camera import SplatCamera
+from softmode.splats.cameras.camera import SplatCamera
 from softmode.splats.splats import Splats
 
 Numbers = Mapping[str, float | Sequence[float]]

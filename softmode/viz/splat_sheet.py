@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.deformables.build.occupancy import Occupancy, fill_splats
+from softmode.deformables.quadrature.occupancy import Occupancy, fill_splats
 from softmode.errors import AssetError, ConfigError, needs_extra
 from softmode.files import whole_file
 from softmode.objects.config import ObjectConfig
 from softmode.objects.source import object_source
 from softmode.splats.components import split_components
-from softmode.splats.pinhole import PinholeCamera
-from softmode.splats.rasterizer import SplatArrays, SplatRasterizer, ViewArrays
+from softmode.splats.raster.pinhole import PinholeCamera
+from softmode.splats.raster.rasterizer import SplatArrays, SplatRasterizer, ViewArrays
 from softmode.splats.splats import SH_DC, Splats
 
 Array = NDArray[np.float64]

@@ -22,13 +22,17 @@ from hypothesis import strategies as st
 
 from softmode.deformables.body.reduced_body import FORMAT_VERSION, ReducedBody
 from softmode.deformables.body.regions import Region
-from softmode.deformables.build import cache
-from softmode.deformables.build.build_body import body_fingerprint, build_body
-from softmode.deformables.build.cache import cache_directory, cached_body, fingerprint_of
-from softmode.deformables.build.functions import RANK_TOLERANCE
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_box, quadrature_from_capsule, quadrature_from_sphere
-from softmode.deformables.build.quadrature_grid import Quadrature
+from softmode.deformables.quadrature.quadrature import (
+    quadrature_from_box,
+    quadrature_from_capsule,
+    quadrature_from_sphere,
+)
+from softmode.deformables.quadrature.quadrature_grid import Quadrature
+from softmode.deformables.reduction import cache
+from softmode.deformables.reduction.build_body import body_fingerprint, build_body
+from softmode.deformables.reduction.cache import cache_directory, cached_body, fingerprint_of
+from softmode.deformables.reduction.functions import RANK_TOLERANCE
+from softmode.deformables.reduction.options import BuildOptions
 from softmode.errors import AssetError, BasisError, ConfigError, MaterialError, StorageError
 from tests.bodies import RECIPES, assert_same, default_box, quadratic_box, smooth_ball
 

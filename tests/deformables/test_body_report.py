@@ -14,14 +14,14 @@ import trimesh
 
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.body.rkpm import make_basis
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.interior import interior_from_quadrature, interior_from_surface, winding_numbers
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_box
-from softmode.deformables.build.quadrature_grid import Quadrature
-from softmode.deformables.build.quadrature_mesh import quadrature_from_mesh
-from softmode.deformables.build.report import FAST_FUNCTIONS, BodyReport, object_findings, report_body
 from softmode.deformables.model.lane_kernels import LANES
+from softmode.deformables.quadrature.interior import interior_from_quadrature, interior_from_surface, winding_numbers
+from softmode.deformables.quadrature.quadrature import quadrature_from_box
+from softmode.deformables.quadrature.quadrature_grid import Quadrature
+from softmode.deformables.quadrature.quadrature_mesh import quadrature_from_mesh
+from softmode.deformables.reduction.build_body import build_body
+from softmode.deformables.reduction.options import BuildOptions
+from softmode.deformables.reduction.report import FAST_FUNCTIONS, BodyReport, object_findings, report_body
 from softmode.deformables.solver.step_tables import ONE_LAUNCH_BLOCKS
 from softmode.envs.tasks.place_in_bin import task as place_in_bin
 from softmode.envs.tasks.push_soft import task as push_soft

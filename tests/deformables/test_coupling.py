@@ -10,10 +10,10 @@ from softmode.deformables.materials.material import Material
 from softmode.deformables.model import status as bits
 from softmode.deformables.model.authoring import add_pins, add_reduced_body
 from softmode.deformables.model.lane_kernels import from_blocks, to_blocks
-from softmode.deformables.solver import assembly_kernels
 from softmode.deformables.solver.evaluate import assemble, evaluate, gather_gradient
 from softmode.deformables.solver.minimise import check_convergence
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
+from softmode.deformables.system import assembly_kernels
 from softmode.errors import ConfigError
 from tests import reference
 from tests.bodies import cube

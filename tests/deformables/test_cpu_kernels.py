@@ -13,15 +13,11 @@ from softmode.deformables.contact import detection_kernels, sample_cpu_kernels
 from softmode.deformables.contact.detection_kernels import CULLED
 from softmode.deformables.materials.material_kernels import MaterialModel
 from softmode.deformables.model.authoring import add_reduced_body
-from softmode.deformables.solver import (
-    assembly_cpu_kernels,
-    assembly_kernels,
-    constraint_cpu_kernels,
-    point_cpu_kernels,
-    step_kernels,
-)
+from softmode.deformables.model.newton_step_kernels import ALL
+from softmode.deformables.potential import constraint_cpu_kernels, evaluate_kernels, point_cpu_kernels
+from softmode.deformables.solver import step_kernels
 from softmode.deformables.solver.evaluate import assemble, evaluate, gather_gradient, solve
-from softmode.deformables.solver.iteration_kernels import ALL
+from softmode.deformables.system import assembly_cpu_kernels, assembly_kernels
 from tests.bodies import cube
 from tests.deformables.test_fused_system import loaded
 from tests.scenes import Scene, random_rotation
@@ -66,7 +62,7 @@ def test_points(model: MaterialModel, project: int) -> None:
     step, one, eight = t.newton_step(0.004), (1, 125), (1, 16)
     t.launch(step_kernels.start_points, one, step)
     start = t.points.start.numpy().copy()
-    t.launch(step_kernels.evaluate_points, (*one, 1), step, t.newton.active, t.arrays.q, int(ALL), 1)
+    t.launch(evaluate_kernels.evaluate_points, (*one, 1), step, t.newton.active, t.arrays.q, int(ALL), 1)
     names = {"energy": DOUBLE, "stress": DOUBLE, "volume_ratio": SINGLE, "hessian": SINGLE}
     expected = {name: getattr(t.points, name).numpy().copy() for name in names}
     for name in (*names, "start"):
@@ -98,7 +94,7 @@ def test_sums(mode_count: int) -> None:
     forces, stiffness = t.arrays.gradient_chunk.numpy().copy(), t.arrays.stiffness.numpy()[0, 0][upper]
     t.arrays.gradient_chunk.zero_()
     t.arrays.stiffness.zero_()
-    t.launch(step_kernels.sum_forces, (1, 1, blocks), step, t.newton.active)
+    t.launch(evaluate_kernels.sum_forces, (1, 1, blocks), step, t.newton.active)
     agree(forces, t.arrays.gradient_chunk.numpy(), DOUBLE)
     t.launch(assembly_kernels.assemble_stiffness, (1, 1, tasks), step)
     agree(stiffness, t.arrays.stiffness.numpy()[0, 0][upper], SINGLE)
@@ -187,7 +183,7 @@ def test_constraints(iteration: int, memory: str, pins: int) -> None:
     for derivatives, evaluated in ((0, 0), (1, 0), (1, 1)):
         found = []
         for kernel, dim, lanes in (
-            (step_kernels.evaluate_constraints, (*shape, 1), (1,)),
+            (evaluate_kernels.evaluate_constraints, (*shape, 1), (1,)),
             (constraint_cpu_kernels.evaluate_constraints, 1, ()),
         ):
             for name in names:

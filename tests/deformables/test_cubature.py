@@ -12,13 +12,13 @@ import pytest
 
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.body.regions import Region
-from softmode.deformables.build import cubature
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.cubature import select_cubature
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_box
-from softmode.deformables.build.reduced_stiffness import elastic_modes, reduced_stiffness
 from softmode.deformables.materials.material_kernels import MaterialModel
+from softmode.deformables.quadrature.quadrature import quadrature_from_box
+from softmode.deformables.reduction import cubature
+from softmode.deformables.reduction.build_body import build_body
+from softmode.deformables.reduction.cubature import select_cubature
+from softmode.deformables.reduction.options import BuildOptions
+from softmode.deformables.reduction.reduced_stiffness import elastic_modes, reduced_stiffness
 from softmode.errors import BasisError, ConfigError
 from tests.bodies import RECIPES, cube, small_box
 from tests.reference import lame, stress
@@ -169,7 +169,7 @@ def test_the_best_trial_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
         errors.append(found.force_error)
         return found
 
-    monkeypatch.setattr("softmode.deformables.build.build_body.select_cubature", poorer)
+    monkeypatch.setattr("softmode.deformables.reduction.build_body.select_cubature", poorer)
     options = BuildOptions(function_count=36, cubature_count=384, cubature_error=1e-9)
     with pytest.warns(RuntimeWarning, match="cubature_error"):
         body = build_body(quadrature_from_box((0.06, 0.05, 0.04), point_count=800), options, progress=False)

@@ -31,11 +31,11 @@ from softmode.deformables import (
     quadrature_from_box,
     quadrature_from_mesh,
 )
-from softmode.deformables.build import basis
-from softmode.deformables.build.local_handles import gather_at_lips
-from softmode.deformables.build.reduced_stiffness import reduced_stiffness
-from softmode.deformables.build.sources import mass_points, unpack_sources
-from softmode.deformables.build.visibility import lips_of
+from softmode.deformables.reduction import basis
+from softmode.deformables.reduction.kernel_visibility import lips_of
+from softmode.deformables.reduction.local_handles import gather_at_lips
+from softmode.deformables.reduction.reduced_stiffness import reduced_stiffness
+from softmode.deformables.reduction.sources import mass_points, unpack_sources
 from softmode.errors import ConfigError
 from tests.shapes import voxels
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from softmode.deformables.body.reduced_body import ReducedBody
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_box
 from softmode.deformables.contact.dents import DENT_FACTOR, WALL_SHARE, dent_lengths, dent_weights, resolved_size
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body
+from softmode.deformables.quadrature.quadrature import quadrature_from_box
+from softmode.deformables.reduction.build_body import build_body
+from softmode.deformables.reduction.options import BuildOptions
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from tests import reference
 from tests.bodies import cube, held_bar, sheet, smooth_ball

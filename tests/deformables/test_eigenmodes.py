@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from softmode.deformables.body.rkpm import KernelName, make_basis
-from softmode.deformables.build.eigenmodes import solve_eigenmodes
+from softmode.deformables.reduction.eigenmodes import solve_eigenmodes
 from softmode.errors import ConfigError
 
 SIZE = np.array([0.06, 0.05, 0.04])

@@ -17,15 +17,15 @@ import trimesh
 
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.body.regions import Region
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.elastic_functions import SPACE_ERROR, SPACE_MODE_COUNTS
-from softmode.deformables.build.options import FUNCTION_COUNT, BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_box, quadrature_from_mesh
-from softmode.deformables.build.quadrature_grid import Quadrature
-from softmode.deformables.build.reduced_stiffness import reduced_stiffness
-from softmode.deformables.build.report import report_body
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body
+from softmode.deformables.quadrature.quadrature import quadrature_from_box, quadrature_from_mesh
+from softmode.deformables.quadrature.quadrature_grid import Quadrature
+from softmode.deformables.reduction.build_body import build_body
+from softmode.deformables.reduction.elastic_functions import SPACE_ERROR, SPACE_MODE_COUNTS
+from softmode.deformables.reduction.options import FUNCTION_COUNT, BuildOptions
+from softmode.deformables.reduction.reduced_stiffness import reduced_stiffness
+from softmode.deformables.reduction.report import report_body
 from softmode.errors import ConfigError
 from tests.marks import rest_but
 from tests.oracle.solids import eigenvalues

@@ -10,8 +10,8 @@ import warp as wp
 
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body
-from softmode.deformables.solver.energies import SoftEnergies
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
+from softmode.deformables.tools.energies import SoftEnergies
 from softmode.errors import ConfigError
 from tests import reference
 from tests.bodies import cube

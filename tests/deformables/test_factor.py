@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from softmode.deformables.model.lane_kernels import LANES, pad
-from softmode.deformables.solver.factor import BlockCholesky
+from softmode.deformables.system.factor import BlockCholesky
 
 FLOAT32 = float(np.finfo(np.float32).eps)
 

@@ -6,17 +6,17 @@ import pytest
 import warp as wp
 
 from softmode.deformables.model.authoring import add_reduced_body
+from softmode.deformables.model.newton_step_kernels import NewtonArrays
 from softmode.deformables.model.struct_kernels import Basis, PointConstraints, Rigid
 from softmode.deformables.solver.evaluate import assemble, evaluate, gather_gradient, solve
-from softmode.deformables.solver.fused_system_kernels import (
+from softmode.deformables.solver.step_tables import ONE_LAUNCH_BLOCKS, fits_in_shared_memory, newton_notes
+from softmode.deformables.system.shared_system_kernels import (
     STATIC_BYTES,
     dynamic_floats,
     shared_bytes,
     shared_direction_of,
     shared_floats,
 )
-from softmode.deformables.solver.iteration_kernels import NewtonArrays
-from softmode.deformables.solver.step_tables import ONE_LAUNCH_BLOCKS, fits_in_shared_memory, newton_notes
 from tests.bodies import cube
 from tests.marks import rest_but
 from tests.scenes import GRAVITY, Scene

@@ -13,7 +13,7 @@ from softmode.deformables.materials.material import Material
 from softmode.deformables.model import status as bits
 from softmode.deformables.model.authoring import add_reduced_body
 from softmode.deformables.model.compile_ahead import compile_launches
-from softmode.deformables.solver.fused_newton_kernels import newton_kernel
+from softmode.deformables.newton.one_launch_kernels import newton_kernel
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from tests.bodies import cube
 from tests.marks import rest_but

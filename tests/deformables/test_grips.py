@@ -7,9 +7,9 @@ import warp as wp
 
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_pins, add_reduced_body
-from softmode.deformables.solver.parameters import set_parameters
 from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
 from softmode.deformables.tools.grips import Grips, add_grip_slots
+from softmode.deformables.tools.parameters import set_parameters
 from softmode.errors import ConfigError
 from tests.bodies import cube
 from tests.scenes import GRAVITY, Scene, add_free_box, rotation

@@ -7,7 +7,7 @@ from benchmarks.impacts import drop
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body
 from softmode.deformables.model.lane_kernels import from_blocks, to_blocks
-from softmode.deformables.solver import rigid_start_kernels, search_kernels
+from softmode.deformables.newton import rigid_start_kernels, search_kernels
 from softmode.deformables.solver import step_kernels as kernels
 from softmode.deformables.solver.evaluate import evaluate
 from tests import reference

@@ -14,7 +14,7 @@ from softmode.deformables.model.authoring import add_pins, add_reduced_body
 from softmode.deformables.model.compile_ahead import compile_launches
 from softmode.deformables.solver.evaluate import assemble, evaluate, gather_gradient, solve
 from softmode.deformables.solver.step_tables import newton_notes
-from softmode.deformables.solver.tile_kernels import TILE, assemble_tiles, chunk_count, tile_count
+from softmode.deformables.system.tile_kernels import TILE, assemble_tiles, chunk_count, tile_count
 from tests.bodies import many_functions
 from tests.marks import rest_but
 from tests.scenes import GRAVITY, Scene

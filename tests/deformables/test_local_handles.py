@@ -24,8 +24,8 @@ from softmode.deformables import (
     quadrature_from_box,
     quadrature_from_mesh,
 )
-from softmode.deformables.build.local_handles import place_kernels
-from softmode.deformables.build.quadrature_grid import Quadrature
+from softmode.deformables.quadrature.quadrature_grid import Quadrature
+from softmode.deformables.reduction.local_handles import place_kernels
 from softmode.errors import ConfigError
 from softmode.usd.handles import coordinates_from_handles, handles_from_coordinates
 from tests.oracle.solids import SOLIDS, stiffness

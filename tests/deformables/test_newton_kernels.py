@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 import warp as wp
 
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.solver import minimise, newton_round_kernels
-from softmode.deformables.solver.fused_newton_kernels import newton_kernel
+from softmode.deformables.newton import round_kernels
+from softmode.deformables.newton.one_launch_kernels import newton_kernel
+from softmode.deformables.reduction.options import BuildOptions
+from softmode.deformables.solver import minimise
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from softmode.deformables.solver.step_tables import StepTables
 from softmode.envs.presets import RL_BUILD, RL_SOLVER, rl_scene
@@ -155,8 +156,8 @@ def test_slowest_worlds_go_beside_the_rounds() -> None:
     def chosen(iterations: list[int], room: int) -> list[int]:
         state.iteration.assign(iterations)
         state.level_count.zero_()
-        tables.launch(newton_round_kernels.expect_iterations, 6, step)
-        tables.launch(newton_round_kernels.start_trials, (6, 1), step, 0, room)
+        tables.launch(round_kernels.expect_iterations, 6, step)
+        tables.launch(round_kernels.start_trials, (6, 1), step, 0, room)
         return state.aside.numpy().tolist()
 
     assert chosen([1, 2, 3, 5, 9, 20], 6) == [0, 1, 1, 1, 1, 1]
@@ -174,13 +175,13 @@ def test_numbers_one_by_one_grasp_as_eights_do(monkeypatch: pytest.MonkeyPatch) 
     """
     eights = grasp("cpu", one_launch=True)
     options = {"extra_build_options": wp.ModuleBuildOptions(extra_cpu_preamble="#define SOFTMODE_ONE_BY_ONE")}
-    for make in (newton_round_kernels.check_kernel, newton_round_kernels.direct_kernel):
-        monkeypatch.setattr(newton_round_kernels, make.__name__, one_by_one(make, options))
-    wp.set_module_options(options, module=newton_round_kernels)
+    for make in (round_kernels.check_kernel, round_kernels.direct_kernel):
+        monkeypatch.setattr(round_kernels, make.__name__, one_by_one(make, options))
+    wp.set_module_options(options, module=round_kernels)
     try:
         ones = grasp("cpu", one_launch=True, rounds=40)
     finally:
-        wp.set_module_options({"extra_build_options": None}, module=newton_round_kernels)
+        wp.set_module_options({"extra_build_options": None}, module=round_kernels)
     for name in ("q", "joint_q"):
         np.testing.assert_allclose(ones[name], eights[name], atol=1.0e-7)
     np.testing.assert_allclose(ones["force"], eights["force"], atol=1.0e-5 * np.abs(eights["force"]).max())
@@ -213,7 +214,7 @@ def test_one_launch_on_cuda(shared: bool, rounds: int, room: int) -> None:
     np.testing.assert_allclose(at_once["force"], apart["force"], atol=1.0e-3 * np.abs(apart["force"]).max())
 
 
-EVALUATED = ("step_kernels", ("evaluate_constraints", "evaluate_points"))
+EVALUATED = ("potential.evaluate_kernels", ("evaluate_constraints", "evaluate_points"))
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="needs the CUDA compiler of Warp's wheel")
@@ -223,16 +224,16 @@ EVALUATED = ("step_kernels", ("evaluate_constraints", "evaluate_points"))
         [EVALUATED],
         [
             EVALUATED,
-            ("search_kernels", ("check_iterates", "reuse_hessians")),
-            ("assembly_kernels", ("assemble_matrix", "assemble_columns", "assemble_pins")),
-            ("tile_kernels", ("assemble_tiles",)),
-            ("newton_round_kernels", ("evaluate_trials", "differentiate_points", "assemble_stiffness")),
+            ("newton.search_kernels", ("check_iterates", "reuse_hessians")),
+            ("system.assembly_kernels", ("assemble_matrix", "assemble_columns", "assemble_pins")),
+            ("system.tile_kernels", ("assemble_tiles",)),
+            ("newton.round_kernels", ("evaluate_trials", "differentiate_points", "assemble_stiffness")),
         ],
     ),
 )
 def test_no_thread_copies_the_tables(module: str, entries: tuple[str, ...], tmp_path: Path) -> None:
     """Compiled for CUDA, no kernel has the 8 kB of the step's struct in its threads' own memory."""
-    name = f"softmode.deformables.solver.{module}"
+    name = f"softmode.deformables.{module}"
     for part in (name, f"{name}.phases"):
         if wp.get_module(part).kernels:
             wp.compile_aot_module(wp.get_module(part), arch=90, module_dir=tmp_path, use_ptx=True)

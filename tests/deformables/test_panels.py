@@ -8,7 +8,7 @@ import pytest
 import warp as wp
 
 from softmode.deformables.model.lane_kernels import LANES, pad
-from softmode.deformables.solver.factor import PANEL_UNKNOWNS, BlockCholesky
+from softmode.deformables.system.factor import PANEL_UNKNOWNS, BlockCholesky
 from tests.deformables.test_factor import FLOAT32, eliminated, in_parts, placed, positive_definite, related_parts
 
 CUDA = pytest.param("cuda:0", marks=[pytest.mark.gpu, pytest.mark.skipif(not wp.is_cuda_available(), reason="no GPU")])

@@ -8,7 +8,7 @@ import warp as wp
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model import status as bits
 from softmode.deformables.model.authoring import MATERIAL_FIELDS, add_pins, add_reduced_body
-from softmode.deformables.solver.parameters import PARAMETER_FLAGS, PARAMETER_LIMITS, ShapeFriction, set_parameters
+from softmode.deformables.tools.parameters import PARAMETER_FLAGS, PARAMETER_LIMITS, ShapeFriction, set_parameters
 from softmode.errors import ConfigError, MaterialError
 from tests.bodies import clamped, cube
 from tests.scenes import GRAVITY, Scene, add_gripper, rotation

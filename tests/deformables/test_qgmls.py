@@ -20,7 +20,7 @@ from softmode.deformables import (
     with_integrator_points,
 )
 from softmode.deformables.body.qgmls import BasisQGMLS
-from softmode.deformables.build.local_handles import COVERED, covering_radii, place_kernels
+from softmode.deformables.reduction.local_handles import COVERED, covering_radii, place_kernels
 from softmode.errors import BasisError, ConfigError
 from tests.shape_trials import drop
 

@@ -11,16 +11,16 @@ import trimesh
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from softmode.deformables.build.quadrature import (
+from softmode.deformables.quadrature.quadrature import (
     quadrature_from_box,
     quadrature_from_capsule,
     quadrature_from_points,
     quadrature_from_sphere,
     quadrature_from_splats,
 )
-from softmode.deformables.build.quadrature_grid import Quadrature
-from softmode.deformables.build.quadrature_implicit import quadrature_from_implicit
-from softmode.deformables.build.quadrature_mesh import quadrature_from_mesh
+from softmode.deformables.quadrature.quadrature_grid import Quadrature
+from softmode.deformables.quadrature.quadrature_implicit import quadrature_from_implicit
+from softmode.deformables.quadrature.quadrature_mesh import quadrature_from_mesh
 from softmode.errors import AssetError, ConfigError
 from tests.marks import rest_but
 from tests.oracle.solids import SOLIDS

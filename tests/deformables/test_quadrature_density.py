@@ -16,7 +16,7 @@ from softmode.deformables import (
     quadrature_from_density,
     with_integrator_points,
 )
-from softmode.deformables.build.quadrature_density import ALPHA, KAPPA, disk_radii
+from softmode.deformables.quadrature.quadrature_density import ALPHA, KAPPA, disk_radii
 from softmode.errors import AssetError, ConfigError
 
 BOX = np.array([[-0.07, -0.07, -0.05], [0.07, 0.07, 0.05]])

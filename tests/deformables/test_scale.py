@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import warp as wp
 
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_box
 from softmode.deformables.gradients.adjoint import AdjointReduced
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_pins, add_reduced_body, drive_regions
 from softmode.deformables.model.lane_kernels import from_blocks
+from softmode.deformables.quadrature.quadrature import quadrature_from_box
+from softmode.deformables.reduction.build_body import build_body
+from softmode.deformables.reduction.options import BuildOptions
 from softmode.deformables.skinning.skin_splats import SkinSplats
 from softmode.deformables.solver.attachments import attach
 from softmode.deformables.solver.evaluate import assemble, gather_gradient

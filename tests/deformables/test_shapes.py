@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.reduction.build_body import build_body
+from softmode.deformables.reduction.options import BuildOptions
 from tests.marks import rest_but
 from tests.shape_trials import Voxels, base_of, drop, solve_reference, try_build, try_pull, voxelise
 from tests.shapes import SHAPES

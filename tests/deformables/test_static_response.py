@@ -13,14 +13,14 @@ import pytest
 from softmode.deformables.body.regions import Envelope, Region
 from softmode.deformables.body.rkpm import ShapeFunctions, make_basis
 from softmode.deformables.body.skinning_weights import enveloped
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.eigenmodes import solve_eigenmodes
-from softmode.deformables.build.galerkin import elastic_matrix, mass_and_gradient_matrix, mass_matrix
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_box
-from softmode.deformables.build.quadrature_grid import Quadrature
-from softmode.deformables.build.region_samples import pieces_near, refine_at_faces
-from softmode.deformables.build.static_response import (
+from softmode.deformables.quadrature.quadrature import quadrature_from_box
+from softmode.deformables.quadrature.quadrature_grid import Quadrature
+from softmode.deformables.reduction.build_body import build_body
+from softmode.deformables.reduction.eigenmodes import solve_eigenmodes
+from softmode.deformables.reduction.galerkin import elastic_matrix, mass_and_gradient_matrix, mass_matrix
+from softmode.deformables.reduction.options import BuildOptions
+from softmode.deformables.reduction.region_samples import pieces_near, refine_at_faces
+from softmode.deformables.reduction.static_response import (
     lame_parameters,
     second_order_load,
     solve_harmonic_weights,

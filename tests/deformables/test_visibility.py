@@ -16,19 +16,19 @@ from scipy.spatial.transform import Rotation
 
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.body.rkpm import BasisRKPM, make_basis
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.cut import cut_body
-from softmode.deformables.build.detours import find_detours
-from softmode.deformables.build.octants import octants_of
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.patch import Patch
-from softmode.deformables.build.quadrature import quadrature_from_implicit, quadrature_from_mesh
-from softmode.deformables.build.quadrature_grid import Quadrature
-from softmode.deformables.build.sources import unpack_sources
-from softmode.deformables.build.visibility import Material, divide_at_gaps, find_visibility, material_of
+from softmode.deformables.quadrature.octants import octants_of
+from softmode.deformables.quadrature.quadrature import quadrature_from_implicit, quadrature_from_mesh
+from softmode.deformables.quadrature.quadrature_grid import Quadrature
+from softmode.deformables.reduction.build_body import build_body
+from softmode.deformables.reduction.cut import cut_body
+from softmode.deformables.reduction.kernel_detours import find_detours
+from softmode.deformables.reduction.kernel_visibility import Material, divide_at_gaps, find_visibility, material_of
+from softmode.deformables.reduction.options import BuildOptions
+from softmode.deformables.reduction.patch import Patch
+from softmode.deformables.reduction.sources import unpack_sources
 from softmode.errors import AssetError, BasisError
 from softmode.files import write_archive
-from softmode.objects.primitives import scaled, turned
+from softmode.objects.shapes.primitives import scaled, turned
 from tests.bodies import brick
 from tests.marks import rest_but
 from tests.shapes import voxels

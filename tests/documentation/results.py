@@ -195,7 +195,7 @@ def _train(names: dict[str, Any], folder: Path) -> None:
 def _body_tool(names: dict[str, Any], folder: Path) -> None:
     """What the page makes is well."""
     assert names["report"].severity == 0
-    np.testing.assert_array_equal(names["thing"].splats.means, names["ring"].splats.means)
+    np.testing.assert_array_equal(names["toy"].splats.means, names["ring"].splats.means)
 
 
 @_result("docs/usd.md")

@@ -14,8 +14,8 @@ import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
 from softmode.envs import check_vector_env
-from softmode.envs.check import RULES, VALUES
 from softmode.errors import ConfigError, EnvironmentCheckError, SoftmodeError
+from softmode.vector_check import RULES, VALUES
 from tests.envs.walks import WalkVectorEnv
 
 MODES = pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.name)

@@ -15,7 +15,7 @@ from softmode.envs import EnvState, PushSoftConfig, SoftEnv, SoftVectorEnv, scri
 from softmode.envs.catalogue import config_class
 from softmode.errors import ConfigError, StateError
 from softmode.files import archive_bytes
-from softmode.splats.camera_randomization import CameraRandomization
+from softmode.splats.cameras.camera_randomization import CameraRandomization
 from tests.envs.conftest import MakeEnv
 
 TASKS = ("LiftSoft", "PushSoft", "PressSoft", "ShapeSoft", "RopeRoute", "PlaceInBin")

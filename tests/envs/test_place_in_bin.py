@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import softmode  # noqa: F401  (registers the environments)
-from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.model.status import WORLD_COLLAPSED, WORLD_ITERATION_LIMIT, WORLD_PENETRATION
+from softmode.deformables.reduction.options import BuildOptions
 from softmode.envs.end_reason import EndReason
 from softmode.envs.scripted import scripted_policy
 from softmode.envs.tasks.place_in_bin.scripted import ScriptedPlace

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.reduction.options import BuildOptions
 from softmode.envs.scripted import scripted_policy
 from softmode.envs.tasks.push_soft.task import PushSoftConfig, PushSoftEnv, push_scene
 from softmode.errors import ConfigError

@@ -22,9 +22,9 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 
 import softmode
 from softmode.envs import check_vector_env
-from softmode.envs.check import RULES, VALUES
-from softmode.envs.check.values import as_numpy, equal
 from softmode.envs.tasks.lift_soft.task import LiftSoftEnv
+from softmode.vector_check import RULES, VALUES
+from softmode.vector_check.values import as_numpy, equal
 from tests.envs.conftest import MakeEnv
 
 TASKS = list(softmode.ENVIRONMENTS)

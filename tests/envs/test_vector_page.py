@@ -10,7 +10,7 @@ PAGE = Path(__file__).resolve().parents[2] / "docs" / "vector_envs.md"
 
 def test_the_page_names_every_rule() -> None:
     """The table of rules has those that errors name."""
-    from softmode.envs.check import VALUES
+    from softmode.vector_check import VALUES
 
     rows = re.search(r"\| rule \|.*?\n\n", PAGE.read_text(), re.DOTALL)
     assert rows is not None

@@ -245,7 +245,7 @@ def test_particles_of_a_mesh_and_of_a_body_have_its_mass() -> None:
     """Masses sum to density times volume; a lattice of the paper has density times h^3 each, a point its own volume."""
     import trimesh
 
-    from softmode.deformables.build.sources import pack_sources, unpack_sources
+    from softmode.deformables.reduction.sources import pack_sources, unpack_sources
     from tests.bodies import RECIPES, brick
 
     mesh = trimesh.creation.icosphere(subdivisions=3, radius=2.0)

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_points, quadrature_from_splats
-from softmode.deformables.build.report import object_findings, report_body
+from softmode.deformables.quadrature.quadrature import quadrature_from_points, quadrature_from_splats
+from softmode.deformables.reduction.options import BuildOptions
+from softmode.deformables.reduction.report import object_findings, report_body
 from softmode.errors import AssetError
 from softmode.objects import ObjectConfig, load
 from softmode.objects.loader import object_config

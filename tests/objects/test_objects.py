@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.reduction.options import BuildOptions
 from softmode.errors import AssetError, ConfigError
 from softmode.objects import ObjectConfig, load, pipeline
 from softmode.objects.parts import Part, choose_part

@@ -12,8 +12,8 @@ import pytest
 
 from softmode.cli.object_options import ObjectOptions
 from softmode.deformables import BuildOptions, ReducedBody, build_body, elastic_modes, paint, quadrature_from_box
-from softmode.deformables.build.reduced_stiffness import reduced_stiffness
-from softmode.deformables.build.sources import unpack_sources
+from softmode.deformables.reduction.reduced_stiffness import reduced_stiffness
+from softmode.deformables.reduction.sources import unpack_sources
 from softmode.errors import AssetError, ConfigError, MaterialError
 from softmode.objects import ObjectConfig, StifferColor, color_field, load, nearest_field, read_field
 from softmode.objects.paint import brushed

@@ -10,15 +10,15 @@ import trimesh
 
 from softmode.cli.main import main
 from softmode.cli.object_options import ObjectOptions
-from softmode.deformables.build.report import report_body
+from softmode.deformables.reduction.report import report_body
 from softmode.envs.tasks.lift_soft.task import LiftSoftConfig, LiftSoftEnv
 from softmode.errors import AssetError, ConfigError, GraspError
 from softmode.learning.config_values import split_config
 from softmode.objects import PRESETS, ObjectConfig, load, read_mesh
-from softmode.objects.level_sets import follow, level_mesh, torus
-from softmode.objects.preset_shapes import PaintedSolid
-from softmode.objects.presets import preset_mesh, preset_surface
 from softmode.objects.rest_grasps import rest_grasps
+from softmode.objects.shapes.level_sets import follow, level_mesh, torus
+from softmode.objects.shapes.preset_shapes import PaintedSolid
+from softmode.objects.shapes.presets import preset_mesh, preset_surface
 from softmode.objects.source import object_source
 from softmode.robots import ArmDescription, ParallelJaw
 from softmode.splats import read_splats

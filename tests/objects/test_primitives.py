@@ -13,11 +13,11 @@ from scipy.integrate import solve_bvp
 from trimesh.visual import ColorVisuals
 
 from softmode.deformables import BuildOptions, Material
-from softmode.deformables.build.quadrature_mesh import cap_holes
 from softmode.deformables.model.authoring import add_pins, add_reduced_body
+from softmode.deformables.quadrature.quadrature_mesh import cap_holes
 from softmode.errors import ConfigError
 from softmode.objects import ObjectConfig, SoftObject, load, pipeline, task_objects
-from softmode.objects.primitives import checker, primitive_mesh, primitive_quadrature
+from softmode.objects.shapes.primitives import checker, primitive_mesh, primitive_quadrature
 from softmode.objects.source import object_source
 from softmode.splats import ColoredMesh
 from softmode.splats.splats import rotations_from_quats

@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.body.regions import Region
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_box, quadrature_from_mesh
-from softmode.deformables.build.quadrature_grid import Quadrature
+from softmode.deformables.quadrature.quadrature import quadrature_from_box, quadrature_from_mesh
+from softmode.deformables.quadrature.quadrature_grid import Quadrature
+from softmode.deformables.reduction.build_body import build_body
+from softmode.deformables.reduction.options import BuildOptions
 from tests.oracle.solids import stiffness
 
 Array = NDArray[np.float64]

@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks.accuracy import affine
 from benchmarks.accuracy_runner import Result, Row, run
-from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.reduction.options import BuildOptions
 from tests.marks import rest_but
 
 MARGIN = 1.3

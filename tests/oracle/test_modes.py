@@ -12,10 +12,10 @@ import pytest
 
 from benchmarks.moduli import CASES, two_moduli, two_moduli_mesh
 from benchmarks.springs import HARD, RATIO, end_region
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.hold import hold
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_box, quadrature_from_mesh
+from softmode.deformables.quadrature.quadrature import quadrature_from_box, quadrature_from_mesh
+from softmode.deformables.reduction.build_body import build_body
+from softmode.deformables.reduction.hold import hold
+from softmode.deformables.reduction.options import BuildOptions
 from tests.marks import rest_but
 from tests.oracle.bend import BAR, bent_body, bent_solid
 from tests.oracle.fem import Mesh, free_eigenvalues

@@ -123,6 +123,10 @@ def test_round_trip(tmp_path):
     np.savez(tmp_path / "plain.npz", density=arrays["density"], bounds=[[0, 0, 0], [3, 4, 5]], rgb=rgb)
     plain = read_radiance(tmp_path / "plain.npz")
     np.testing.assert_allclose(plain.axes, np.eye(3))
+    np.savez(tmp_path / "flat.npz", density=arrays["density"].ravel(), bounds=[[0, 0, 0], [3, 4, 5]], rgb=rgb)
+    with pytest.raises(AssetError, match="density has shape") as caught:
+        read_radiance(tmp_path / "flat.npz")
+    assert caught.value.hint
     np.testing.assert_allclose(plain.sh[..., 0, :], sh_of_colors(rgb / 255.0), atol=2e-3)
     assert is_radiance(tmp_path / "plain.npz") and is_radiance(tmp_path / "field.npz")
     with pytest.raises(AssetError, match="Name it like"):

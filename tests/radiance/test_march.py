@@ -16,7 +16,7 @@ from softmode.radiance import MarchOptions, RadianceGrid, RadianceMarch, render_
 from softmode.radiance.march import holds_of
 from softmode.scenes import BoundSplats
 from softmode.splats import PinholeCamera, SplatArrays, SplatRasterizer, ViewArrays
-from softmode.splats.picture_fit import FitOptions
+from softmode.splats.fit.picture_fit import FitOptions
 from tests.radiance.fields import bent, block_body, block_field, camera, psnr
 
 WHITE = np.ones(3)

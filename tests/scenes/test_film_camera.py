@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from softmode.envs.cameras import FollowCamera, square_camera
 from softmode.envs.markers import dots
 from softmode.scenes.film_camera import FilmCamera
-from softmode.splats.camera import CameraOptions, SplatCamera
-from softmode.splats.rasterizer import SplatArrays
+from softmode.splats.cameras.camera import CameraOptions, SplatCamera
+from softmode.splats.raster.rasterizer import SplatArrays
 
 EDGE = 96
 CAMERA = square_camera("front", EDGE, (0.5, -0.45, 0.4), (0.0, 0.0, 0.05), 0.6)

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 import warp as wp
 
-from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.status import status_reasons
+from softmode.deformables.reduction.options import BuildOptions
 from softmode.deformables.solver.solver_reduced import SolverReduced
 from softmode.errors import ConfigError
 from softmode.objects import ObjectConfig, Placed, SoftObject, load
 from softmode.scenes import SplatScene
-from softmode.splats.pinhole import PinholeCamera
+from softmode.splats.raster.pinhole import PinholeCamera
 from softmode.viz.film import Film
 from tests.scenes import GRAVITY
 

@@ -7,9 +7,9 @@ import numpy as np
 import warp as wp
 
 from softmode.splats import Splats
-from softmode.splats.camera import CameraOptions
-from softmode.splats.pinhole import PinholeCamera
-from softmode.splats.rasterizer import SplatArrays
+from softmode.splats.cameras.camera import CameraOptions
+from softmode.splats.raster.pinhole import PinholeCamera
+from softmode.splats.raster.rasterizer import SplatArrays
 from softmode.splats.splats import SH_DC
 
 SIZE = 64

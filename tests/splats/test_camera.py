@@ -11,11 +11,11 @@ import warp as wp
 
 from softmode.errors import ConfigError
 from softmode.splats import make_plush
-from softmode.splats.camera import CameraOptions, SplatCamera
-from softmode.splats.pinhole import PinholeCamera
-from softmode.splats.rasterizer import RasterizerOptions, SplatArrays, SplatRasterizer, ViewArrays
-from softmode.splats.rasterizer_adjoint import AdjointRasterizer
-from softmode.splats.shadow import ShadowOptions
+from softmode.splats.cameras.camera import CameraOptions, SplatCamera
+from softmode.splats.cameras.shadow import ShadowOptions
+from softmode.splats.raster.pinhole import PinholeCamera
+from softmode.splats.raster.rasterizer import RasterizerOptions, SplatArrays, SplatRasterizer, ViewArrays
+from softmode.splats.raster.rasterizer_adjoint import AdjointRasterizer
 from softmode.splats.splats import rotations_from_quats
 from tests.splats.camera_scene import PLAIN, SIZE, arrays, camera, marker, scene
 

@@ -10,9 +10,9 @@ import warp as wp
 from numpy.typing import NDArray
 
 from softmode.splats import Splats
-from softmode.splats.camera import CameraOptions, SplatCamera
-from softmode.splats.pinhole import PinholeCamera
-from softmode.splats.rasterizer import RasterizerOptions, SplatArrays
+from softmode.splats.cameras.camera import CameraOptions, SplatCamera
+from softmode.splats.raster.pinhole import PinholeCamera
+from softmode.splats.raster.rasterizer import RasterizerOptions, SplatArrays
 from softmode.splats.splats import SH_DC, rotations_from_quats
 from tests.splats.camera_scene import PLAIN, camera, scene
 from tests.splats.dense_reference import DenseImage, render_dense

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from softmode.splats import make_plush
-from softmode.splats.camera import CameraOptions, CameraRandomization, SplatCamera
-from softmode.splats.rasterizer import SplatArrays
+from softmode.splats.cameras.camera import CameraOptions, CameraRandomization, SplatCamera
+from softmode.splats.raster.rasterizer import SplatArrays
 from tests.splats.camera_scene import arrays, camera, scene
 from tests.splats.traced import trace
 

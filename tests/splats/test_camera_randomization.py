@@ -10,10 +10,10 @@ import warp as wp
 
 from softmode.errors import ConfigError
 from softmode.splats import make_plush
-from softmode.splats.camera import CameraOptions, SplatCamera
-from softmode.splats.camera_randomization import CameraRandomization, ViewVariation
-from softmode.splats.pinhole import PinholeCamera
-from softmode.splats.rasterizer import SplatRasterizer, ViewArrays
+from softmode.splats.cameras.camera import CameraOptions, SplatCamera
+from softmode.splats.cameras.camera_randomization import CameraRandomization, ViewVariation
+from softmode.splats.raster.pinhole import PinholeCamera
+from softmode.splats.raster.rasterizer import SplatRasterizer, ViewArrays
 from tests.splats.camera_scene import PLAIN, arrays, camera, scene
 
 SKY = ((0.5, 0.5, 0.5), (0.4, 0.5, 0.6))

@@ -11,7 +11,6 @@ from benchmarks.splat_fidelity import (
     Moved,
     bar_body,
     bend,
-    body_values,
     psnr,
     rest,
     rip,
@@ -56,7 +55,7 @@ def test_deformation_costs_no_fidelity(bar: Splats, dense: Splats, motion: Motio
 
 def test_reduced_body_costs_no_fidelity(bar: Splats) -> None:
     """The same with the functions of a body of 16 modes, in truth and frame: 30 dB in bend and twist."""
-    values, cloud = body_values(bar_body(16)), sample_bar(0.0015)
+    values, cloud = bar_body(16).values, sample_bar(0.0015)
     asset, points = Moved(bar, values), Moved(cloud, values, averaged=False)
     for motion in (bend(np.pi), twist(np.pi)):
         q = asset.fit(motion)

@@ -376,7 +376,7 @@ def test_round_trip_within_the_steps_of_the_format(tmp_path: Path, suffix: str, 
     half_of_255 = 0.5 / 255.0 + 2 * EPSILON
     if suffix == ".ply":
         steps = {
-            "means": 0.0,
+            "means": 2 * EPSILON * np.abs(again.means).max(),
             "quats": 2 * EPSILON,
             "log_scales": 8 * EPSILON,
             "color": 0.0,
@@ -394,7 +394,13 @@ def test_round_trip_within_the_steps_of_the_format(tmp_path: Path, suffix: str, 
             "alpha": half_of_255,
         }
     elif suffix == ".splat":
-        steps = {"means": 0.0, "quats": 2.0 / 128.0, "log_scales": EPSILON * 10, "color": None, "alpha": half_of_255}
+        steps = {
+            "means": 2 * EPSILON * reach,
+            "quats": 2.0 / 128.0,
+            "log_scales": EPSILON * 10,
+            "color": None,
+            "alpha": half_of_255,
+        }
         np.testing.assert_allclose(again.colors(), splats.colors(), atol=half_of_255)
         assert again.sh_degree == 0
     else:
@@ -408,7 +414,7 @@ def test_round_trip_within_the_steps_of_the_format(tmp_path: Path, suffix: str, 
             "alpha": half_of_255,
         }
     found = {
-        "means": again.means.astype(np.float64) - splats.means,
+        "means": again.means.astype(np.float64) + again.offset - splats.means,
         "log_scales": np.log(again.scales.astype(np.float64)) - logs,
         "color": again.sh[:, 0] - color,
         "alpha": again.opacities.astype(np.float64) - splats.opacities,

@@ -12,14 +12,14 @@ import warp as wp
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from softmode.deformables.build.quadrature import quadrature_from_splats
+from softmode.deformables.quadrature.quadrature import quadrature_from_splats
 from softmode.errors import ConfigError
 from softmode.objects.mesh_fit import FitOptions, MeshFit, splats_from_mesh
-from softmode.splats import picture_fit_kernels as kernels
 from softmode.splats.colored_mesh import ColoredMesh
+from softmode.splats.fit import picture_fit_kernels as kernels
+from softmode.splats.fit.reference_views import orbit_poses, render_mesh
 from softmode.splats.mesh_samples import sample_mesh
-from softmode.splats.rasterizer import SplatArrays, SplatRasterizer
-from softmode.splats.reference_views import orbit_poses, render_mesh
+from softmode.splats.raster.rasterizer import SplatArrays, SplatRasterizer
 from softmode.splats.splats import Splats
 from tests.splats.meshes import bumpy_sphere, painted_box, two_objects
 

@@ -17,8 +17,8 @@ from trimesh.visual.material import PBRMaterial, SimpleMaterial
 from softmode.errors import AssetError, ConfigError
 from softmode.objects.mesh_file import read_mesh
 from softmode.splats.colored_mesh import GREY, ColoredMesh
+from softmode.splats.fit.reference_views import orbit_poses, render_mesh
 from softmode.splats.mesh_samples import sample_mesh
-from softmode.splats.reference_views import orbit_poses, render_mesh
 from softmode.splats.splats import rotations_from_quats
 from tests.splats.meshes import bumpy_sphere, painted_box, smooth_texture, two_objects
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from softmode.errors import ConfigError
-from softmode.splats.pinhole import PinholeCamera
+from softmode.splats.raster.pinhole import PinholeCamera
 from softmode.splats.splats import rotations_from_quats
 from tests.splats.camera_scene import camera
 

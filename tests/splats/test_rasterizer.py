@@ -11,7 +11,7 @@ import warp as wp
 
 from softmode.errors import ConfigError
 from softmode.splats import Splats, make_plush
-from softmode.splats.rasterizer import RasterizerOptions, SplatArrays, SplatRasterizer, ViewArrays
+from softmode.splats.raster.rasterizer import RasterizerOptions, SplatArrays, SplatRasterizer, ViewArrays
 from softmode.splats.splats import quats_from_rotations, rotations_from_quats
 from tests.splats.dense_reference import DenseImage, render_dense
 

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from softmode.errors import ConfigError
-from softmode.splats import blend_adjoint_cpu_kernels, blend_adjoint_cuda_kernels
-from softmode.splats.rasterizer import RasterizerOptions, SplatArrays, SplatRasterizer, ViewArrays
-from softmode.splats.rasterizer_adjoint import AdjointRasterizer
-from softmode.splats.rasterizer_kernels import vec6
+from softmode.splats.raster import blend_adjoint_cpu_kernels, blend_adjoint_cuda_kernels
+from softmode.splats.raster.rasterizer import RasterizerOptions, SplatArrays, SplatRasterizer, ViewArrays
+from softmode.splats.raster.rasterizer_adjoint import AdjointRasterizer
+from softmode.splats.raster.rasterizer_kernels import vec6
 from softmode.splats.splats import quats_from_rotations
 from tests.splats import dense_reference
 from tests.splats.dense_reference import render_dense

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from softmode.errors import ConfigError
-from softmode.splats.rasterizer import SplatRasterizer
-from softmode.splats.rasterizer_adjoint import AdjointRasterizer
-from softmode.splats.rasterizer_torch import INPUTS, render
+from softmode.splats.raster.rasterizer import SplatRasterizer
+from softmode.splats.raster.rasterizer_adjoint import AdjointRasterizer
+from softmode.splats.raster.rasterizer_torch import INPUTS, render
 from softmode.splats.splats import rotations_from_quats
 from tests.needs import needs
 from tests.splats.dense_reference import render_dense

@@ -13,8 +13,8 @@ from scipy.optimize import minimize
 from softmode.deformables.skinning.skin_splats import SkinSplats
 from softmode.deformables.skinning.skinning_adjoint import AdjointSkinning
 from softmode.splats import Splats
-from softmode.splats.rasterizer import SplatArrays, SplatRasterizer, ViewArrays
-from softmode.splats.rasterizer_adjoint import AdjointRasterizer, exp_twist
+from softmode.splats.raster.rasterizer import SplatArrays, SplatRasterizer, ViewArrays
+from softmode.splats.raster.rasterizer_adjoint import AdjointRasterizer, exp_twist
 from tests.splats.test_rasterizer import look_at
 
 Array = NDArray[np.float64]

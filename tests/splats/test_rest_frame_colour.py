@@ -11,7 +11,7 @@ import warp as wp
 from softmode.deformables.skinning.skin_splats import SkinSplats
 from softmode.errors import ConfigError
 from softmode.splats import Splats
-from softmode.splats.rasterizer import SplatArrays, SplatRasterizer
+from softmode.splats.raster.rasterizer import SplatArrays, SplatRasterizer
 from tests.splats.dense_reference import DenseImage, render_dense
 from tests.splats.test_rasterizer import BACKGROUND, EYES, assert_matches, ball, dense, device, look_at, views_of
 

@@ -12,10 +12,10 @@ from newton import ShapeFlags
 
 from softmode.errors import ConfigError
 from softmode.splats import Splats, make_plush
-from softmode.splats.camera import SplatCamera
-from softmode.splats.camera_randomization import CameraRandomization
-from softmode.splats.rasterizer import SplatArrays
-from softmode.splats.rigid_splats import RigidSplats, RigidSplatsSkin
+from softmode.splats.cameras.camera import SplatCamera
+from softmode.splats.cameras.camera_randomization import CameraRandomization
+from softmode.splats.cameras.rigid_splats import RigidSplats, RigidSplatsSkin
+from softmode.splats.raster.rasterizer import SplatArrays
 from softmode.splats.splats import rotations_from_quats
 from tests.splats.camera_scene import PLAIN, camera, scene
 

@@ -7,8 +7,8 @@ import pytest
 
 from softmode.errors import ConfigError
 from softmode.splats import make_plush
-from softmode.splats.pinhole import PinholeCamera
-from softmode.splats.rasterizer import RasterizerOptions, SplatArrays, SplatRasterizer, ViewArrays
+from softmode.splats.raster.pinhole import PinholeCamera
+from softmode.splats.raster.rasterizer import RasterizerOptions, SplatArrays, SplatRasterizer, ViewArrays
 
 EDGE = 40
 

@@ -10,8 +10,8 @@ import warp as wp
 from newton.sensors import SensorCamera
 from numpy.typing import NDArray
 
-from softmode.splats.camera import CameraOptions
-from softmode.splats.pinhole import PinholeCamera
+from softmode.splats.cameras.camera import CameraOptions
+from softmode.splats.raster.pinhole import PinholeCamera
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("pxr", reason="needs the extra [usd]")
 
-from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.reduction.options import BuildOptions
 from softmode.errors import AssetError
 from softmode.objects import ObjectConfig, Placed, SoftObject, load
 from softmode.objects.mesh_file import read_mesh

@@ -11,10 +11,10 @@ pytest.importorskip("pxr", reason="needs the extra [usd]")
 
 import newton
 
-from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.reduction.options import BuildOptions
 from softmode.errors import AssetError
 from softmode.foreign import process
-from softmode.objects.stage_scene import open_scene
+from softmode.objects.stage.scene import open_scene
 from softmode.usd import add_usd, read_usd_scene
 from tests.usd.stages import KINDS, Author, Sdf
 

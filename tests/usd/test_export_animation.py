@@ -20,7 +20,7 @@ from softmode.errors import AssetError, ConfigError, SolverDiverged, StorageErro
 from softmode.objects import Placed, SoftObject
 from softmode.scenes import BoundSplats
 from softmode.splats.formats import read_usd
-from softmode.splats.pinhole import PinholeCamera
+from softmode.splats.raster.pinhole import PinholeCamera
 from softmode.splats.splats import rotations_from_quats
 from softmode.usd import (
     UsdAnimation,

@@ -12,7 +12,7 @@ pytest.importorskip("pxr", reason="needs the extra [usd]")
 
 from softmode.errors import AssetError
 from softmode.objects import Placed, SoftObject
-from softmode.objects.stage_bundle import body_of, decode_body, encode_body
+from softmode.objects.stage.bundle import body_of, decode_body, encode_body
 from softmode.usd import read_usd_scene, write_usd
 from softmode.usd.handles import (
     coordinates_from_handles,

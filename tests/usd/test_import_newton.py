@@ -19,19 +19,19 @@ pytest.importorskip("pxr", reason="needs the extra [usd]")
 import newton
 import warp as wp
 
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_splats
-from softmode.deformables.build.quadrature_mesh import quadrature_from_mesh
 from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.namespaces import soft
 from softmode.deformables.model.status import status_reasons
+from softmode.deformables.quadrature.quadrature import quadrature_from_splats
+from softmode.deformables.quadrature.quadrature_mesh import quadrature_from_mesh
+from softmode.deformables.reduction.build_body import build_body
+from softmode.deformables.reduction.options import BuildOptions
 from softmode.deformables.skinning.skin_splats import SkinSplats
 from softmode.deformables.solver.solver_reduced import SolverReduced
 from softmode.errors import AssetError, ConfigError, MissingExtraError
 from softmode.foreign import process
-from softmode.splats.rasterizer import SplatArrays
+from softmode.splats.raster.rasterizer import SplatArrays
 from softmode.usd import add_usd, read_usd_scene
 from tests.marks import rest_but
 from tests.usd.stages import KINDS, Author, Gf, Sdf, UsdGeom, UsdPhysics, UsdShade, UsdVol, box, shell, transform

@@ -14,8 +14,8 @@ from PIL import Image
 
 from softmode.errors import AssetError
 from softmode.objects import load
+from softmode.objects.stage.scene import read_usd_scene
 from softmode.objects.stage_asset import read_usd_mesh
-from softmode.objects.stage_scene import read_usd_scene
 from softmode.splats import read_splats
 from tests.usd.stages import EDGES, Author, Gf, Sdf, Usd, UsdGeom, UsdShade, box, shell
 

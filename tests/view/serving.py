@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.reduction.options import BuildOptions
 from softmode.objects import ObjectConfig
 from softmode.view.app import ViewApp, ViewOptions
 from softmode.view.session import LiveSession

@@ -8,9 +8,9 @@ import newton
 import numpy as np
 import pytest
 
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.patch import Patch
 from softmode.deformables.materials.material import Material
+from softmode.deformables.reduction.options import BuildOptions
+from softmode.deformables.reduction.patch import Patch
 from softmode.envs.tasks.lift_soft.task import LiftSoftConfig, lift_scene
 from softmode.errors import AssetError, ConfigError, MaterialError, StorageError
 from softmode.objects import ObjectConfig, load

@@ -23,7 +23,7 @@ import softmode  # noqa: F401  (registers the environments)
 from softmode.cli.main import main
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body
-from softmode.deformables.solver.energies import SoftEnergies
+from softmode.deformables.tools.energies import SoftEnergies
 from softmode.deformables.tools.sensing import ContactSensor
 from softmode.envs.tasks.lift_soft.task import LiftSoftConfig
 from softmode.errors import ConfigError, MissingExtraError, StorageError

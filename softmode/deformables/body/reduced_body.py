@@ -146,7 +146,7 @@ class ReducedBody:
     detour_lengths: NDArray[np.float32] = dataclasses.field(default_factory=lambda: np.zeros(0, dtype=np.float32))
     """What is added to the distance of each pair [m], > 0, shape (D,)."""
     sources: Mapping[str, NDArray[Any]] | None = dataclasses.field(default=None, repr=False, compare=False)
-    """What it was built from, for :func:`softmode.deformables.hold`, or None; see ``build.sources``."""
+    """What it was built from, for :func:`softmode.deformables.hold`, or None; see ``reduction.sources``."""
 
     @property
     def narrow(self) -> float:

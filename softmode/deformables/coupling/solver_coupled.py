@@ -40,11 +40,11 @@ from softmode.deformables.model.declare import WRENCH
 from softmode.deformables.model.neighbours import warn_foreign_deformables
 from softmode.deformables.model.rigid_dofs import RigidDofs
 from softmode.deformables.model.tables import allocate, host, present
-from softmode.deformables.solver import rigid_row_kernels as rows
+from softmode.deformables.potential import rigid_row_kernels as rows
 from softmode.deformables.solver.detect import differentiate_constraints
 from softmode.deformables.solver.observables import REDUCED_KINDS, RIGID_KINDS, CoupledObservables
 from softmode.deformables.solver.options import SolverReducedOptions
-from softmode.deformables.solver.reduced_solver import ReducedSolver
+from softmode.deformables.solver.solver_base import ReducedSolver
 from softmode.deformables.solver.solver_reduced import SolverReduced
 from softmode.deformables.solver.step_checks import check_step
 from softmode.errors import ConfigError

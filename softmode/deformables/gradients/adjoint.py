@@ -32,15 +32,15 @@ from softmode.deformables.gradients.turning_kernels import find_turning
 from softmode.deformables.model.declare import WRENCH
 from softmode.deformables.model.lane_kernels import vec8d
 from softmode.deformables.model.namespaces import soft
+from softmode.deformables.model.newton_step_kernels import NewtonStep
 from softmode.deformables.model.status import WORLD_NOT_FINITE
 from softmode.deformables.model.struct_kernels import OVERLAP, PointConstraints, Points
 from softmode.deformables.model.tables import allocate
+from softmode.deformables.potential.evaluate_kernels import sum_forces
+from softmode.deformables.potential.spin_kernels import end_spin
 from softmode.deformables.solver.detect import adapt
 from softmode.deformables.solver.evaluate import assemble, evaluate, gather_gradient
-from softmode.deformables.solver.iteration_kernels import NewtonStep
 from softmode.deformables.solver.solver_reduced import SolverReduced
-from softmode.deformables.solver.spin_kernels import end_spin
-from softmode.deformables.solver.step_kernels import sum_forces
 from softmode.errors import ConfigError, SolverDiverged
 
 Array = NDArray[np.float64]

@@ -25,6 +25,7 @@ from softmode.deformables.materials.material_kernels import green_strain, hooke_
 from softmode.deformables.model.declare import struct
 from softmode.deformables.model.deformation_kernels import displacement_gradient, elastic_gradient
 from softmode.deformables.model.lane_kernels import LANES, free_part, vec8d
+from softmode.deformables.model.newton_step_kernels import NewtonArrays
 from softmode.deformables.model.struct_kernels import (
     OVERLAP,
     Basis,
@@ -34,9 +35,8 @@ from softmode.deformables.model.struct_kernels import (
     interpolate,
     interpolate_change,
 )
-from softmode.deformables.solver.iteration_kernels import NewtonArrays
-from softmode.deformables.solver.spin_kernels import Spin, turns
-from softmode.deformables.solver.step_kernels import material_of
+from softmode.deformables.potential.evaluate_kernels import material_of
+from softmode.deformables.potential.spin_kernels import Spin, turns
 
 wp.set_module_options({"enable_backward": False})
 

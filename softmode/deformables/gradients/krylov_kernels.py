@@ -9,8 +9,9 @@ import warp as wp
 
 from softmode.deformables.model.declare import struct
 from softmode.deformables.model.lane_kernels import LANES, barrier, free_part, team_sum, vec8, vec8d
+from softmode.deformables.model.newton_step_kernels import Systems
 from softmode.deformables.model.struct_kernels import Instances
-from softmode.deformables.solver.factor_kernels import Systems, back_substitute
+from softmode.deformables.system.factor_kernels import back_substitute
 
 wp.set_module_options({"enable_backward": False})
 

@@ -9,9 +9,9 @@ import warp as wp
 
 from softmode.deformables.model.declare import struct
 from softmode.deformables.model.lane_kernels import vec8d
+from softmode.deformables.model.newton_step_kernels import mat38d
 from softmode.deformables.model.struct_kernels import Basis, Instances, Motion, blocks_of
-from softmode.deformables.solver.iteration_kernels import mat38d
-from softmode.deformables.solver.spin_kernels import (
+from softmode.deformables.potential.spin_kernels import (
     Spin,
     axial,
     left_jacobian,

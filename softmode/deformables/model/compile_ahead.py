@@ -57,7 +57,7 @@ _BUILDING = (
 )
 _BUILDING_CUDA = (("newton._src.sim.articulation", 8),)
 """What is launched with other blocks: Newton's forward kinematics of more than four joints."""
-_BUILDING_CPU = "softmode.deformables.solver.point_cpu_kernels", "softmode.scenes.replay_kernels"
+_BUILDING_CPU = "softmode.deformables.potential.point_cpu_kernels", "softmode.scenes.replay_kernels"
 
 
 def compile_for_building(device: wp.DeviceLike, *others: ModuleType) -> None:

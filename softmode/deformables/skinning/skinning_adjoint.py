@@ -50,7 +50,7 @@ class AdjointSkinning:
             function_start: First entry of q of this object's instance in each world, int32, shape (world_count,).
             loss_means: Derivative by the deformed centres [1/m], vec3, shape (world_count, total splats).
             loss_covariances: Derivative by the six entries of the deformed covariances [1/m^2], vec6, same shape; see
-                `softmode.splats.rasterizer_adjoint.RasterizerGradients`.
+                `softmode.splats.raster.rasterizer_adjoint.RasterizerGradients`.
             loss_q: Derivative by q [1/m], flat vec3d like q; added to, so that objects can share it.
             loss_rotations: Derivative by a rotation vector of the colours' frames, vec3, shape of `loss_means`; None,
                 or shape (1, 1) as for colours of degree 0, for none.

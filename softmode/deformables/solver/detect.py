@@ -6,9 +6,9 @@ import warp as wp
 from softmode.deformables.contact import detection_kernels as kernels
 from softmode.deformables.contact import sample_cpu_kernels as eights
 from softmode.deformables.model.namespaces import SoftControl, soft
-from softmode.deformables.solver import assembly_kernels as assembly
 from softmode.deformables.solver.step_kernels import fall_back_to_euler
 from softmode.deformables.solver.step_tables import StepTables
+from softmode.deformables.system import assembly_kernels as assembly
 
 
 def detect(tables: StepTables, state: newton.State, control: SoftControl, dt: float, *, prescribed: bool) -> None:

@@ -2,15 +2,15 @@
 
 import warp as wp
 
-from softmode.deformables.solver import assembly_cpu_kernels as assembly_cpu
-from softmode.deformables.solver import assembly_kernels as assembly
-from softmode.deformables.solver import constraint_cpu_kernels as constraint_cpu
-from softmode.deformables.solver import point_cpu_kernels as eights
-from softmode.deformables.solver import step_kernels as kernels
-from softmode.deformables.solver.iteration_kernels import ALL, ENERGIES, TRIAL, NewtonStep
-from softmode.deformables.solver.rigid_row_kernels import evaluate_rows
+from softmode.deformables.model.newton_step_kernels import ALL, ENERGIES, TRIAL, NewtonStep
+from softmode.deformables.potential import constraint_cpu_kernels as constraint_cpu
+from softmode.deformables.potential import evaluate_kernels
+from softmode.deformables.potential import point_cpu_kernels as eights
+from softmode.deformables.potential.rigid_row_kernels import evaluate_rows
 from softmode.deformables.solver.step_tables import StepTables
-from softmode.deformables.solver.tile_kernels import TILE_TEAM, assemble_tiles, tile_count
+from softmode.deformables.system import assembly_cpu_kernels as assembly_cpu
+from softmode.deformables.system import assembly_kernels as assembly
+from softmode.deformables.system.tile_kernels import TILE_TEAM, assemble_tiles, tile_count
 
 
 def evaluate(tables: StepTables, dt: float, *, derivatives: bool) -> None:
@@ -27,7 +27,7 @@ def evaluate(tables: StepTables, dt: float, *, derivatives: bool) -> None:
     found = ALL if derivatives else ENERGIES
     _evaluate(t, dt, t.newton.active, t.arrays.q, t.rigid.table.r, found=int(found), forces=derivatives)
     if derivatives:
-        t.launch_teams(kernels.list_constraints, t.layout.instance_count, t.step, t.team)
+        t.launch_teams(evaluate_kernels.list_constraints, t.layout.instance_count, t.step, t.team)
 
 
 def evaluate_trial(tables: StepTables, dt: float) -> None:
@@ -43,8 +43,8 @@ def _evaluate(
     step = t.newton_step(dt)
     if t.model.device.is_cuda:
         points, constraints = (*t.point_tasks, t.lanes), (*t.constraints.row.shape, t.lanes)
-        t.launch(kernels.evaluate_points, points, step, selected, q, found, t.lanes)
-        t.launch(kernels.evaluate_constraints, constraints, step, selected, q, r, int(forces), t.lanes)
+        t.launch(evaluate_kernels.evaluate_points, points, step, selected, q, found, t.lanes)
+        t.launch(evaluate_kernels.evaluate_constraints, constraints, step, selected, q, r, int(forces), t.lanes)
     else:
         t.launch(eights.evaluate_eights, t.point_tasks, step, selected, q, found)
         t.launch(constraint_cpu.evaluate_constraints, t.layout.instance_count, step, selected, q, r, int(forces))
@@ -58,10 +58,10 @@ def gather_gradient(tables: StepTables, dt: float) -> None:
     count = t.layout.instance_count
     if t.model.device.is_cuda:
         dim = (count, t.arrays.gradient_chunk.shape[1], t.layout.block_count)
-        t.launch(kernels.sum_forces, dim, step, t.newton.active)
+        t.launch(evaluate_kernels.sum_forces, dim, step, t.newton.active)
     else:
         t.launch(assembly_cpu.sum_forces, count, step, t.newton.active)
-    t.launch(kernels.sum_gradient, t.unknowns, step)
+    t.launch(evaluate_kernels.sum_gradient, t.unknowns, step)
 
 
 def stiffness_tasks(blocks: int) -> int:

@@ -6,7 +6,8 @@ import warp as wp
 from softmode.deformables.contact import dent_kernels, penalty_kernels
 from softmode.deformables.contact import friction_memory_kernels as memory_kernels
 from softmode.deformables.model.namespaces import soft
-from softmode.deformables.solver import attachment_kernels, point_cpu_kernels, spin_kernels
+from softmode.deformables.potential import point_cpu_kernels, spin_kernels
+from softmode.deformables.solver import attachment_kernels, reset_kernels
 from softmode.deformables.solver import step_kernels as kernels
 from softmode.deformables.solver.step_tables import StepTables
 
@@ -64,7 +65,7 @@ def reset(tables: StepTables, state: newton.State, world_mask: wp.array, flags: 
     count, world = t.layout.instance_count, t.parameters.instance_world
     chosen = (int(flags) & int(newton.StateFlags.PARTICLE_Q), int(flags) & int(newton.StateFlags.PARTICLE_QD))
     t.launch(
-        kernels.reset_functions,
+        reset_kernels.reset_functions,
         (count, t.layout.stride),
         *(t.instances, t.basis, initial.placed_scale, world, world_mask, *chosen),
         *(initial.q, initial.qd, out.q, out.qd, out.dt_before),
@@ -73,7 +74,7 @@ def reset(tables: StepTables, state: newton.State, world_mask: wp.array, flags: 
         memory_kernels.forget_slip, every, t.instances, world, world_mask, out.stick_shape, out.stick_partner, out.dent
     )
     t.launch(
-        kernels.reset_worlds,
+        reset_kernels.reset_worlds,
         max(count, t.model.body_count),
         *(t.instances, world, t.model.body_world, world_mask, t.newton.status),
         *(t.instance_force, t.body_wrench, t.constraints.count, t.constraints.pair_count, t.newton.cached),

@@ -4,9 +4,9 @@ import warp as wp
 
 from softmode.deformables.model.declare import launch_teams
 from softmode.deformables.model.lane_kernels import LANES
-from softmode.deformables.solver import newton_round_kernels as rounds
-from softmode.deformables.solver import rigid_start_kernels
-from softmode.deformables.solver import search_kernels as search
+from softmode.deformables.newton import rigid_start_kernels
+from softmode.deformables.newton import round_kernels as rounds
+from softmode.deformables.newton import search_kernels as search
 from softmode.deformables.solver import step_kernels as kernels
 from softmode.deformables.solver.evaluate import (
     assemble,

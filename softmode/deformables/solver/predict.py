@@ -3,9 +3,9 @@
 import newton
 
 from softmode.deformables.model.namespaces import SoftControl, soft
-from softmode.deformables.solver import spin_kernels
+from softmode.deformables.potential import spin_kernels
+from softmode.deformables.potential.point_cpu_kernels import start_eights
 from softmode.deformables.solver import step_kernels as kernels
-from softmode.deformables.solver.point_cpu_kernels import start_eights
 from softmode.deformables.solver.step_tables import StepTables
 
 

@@ -28,7 +28,7 @@ from softmode.deformables.solver.minimise import minimise
 from softmode.deformables.solver.observables import ReducedObservableKind, ReducedObservables
 from softmode.deformables.solver.options import SolverReducedOptions
 from softmode.deformables.solver.predict import predict
-from softmode.deformables.solver.reduced_solver import ReducedSolver
+from softmode.deformables.solver.solver_base import ReducedSolver
 from softmode.deformables.solver.step_checks import check_step
 from softmode.deformables.solver.step_tables import allocate_tables
 from softmode.errors import ConfigError

@@ -21,6 +21,7 @@ from softmode.deformables.model.declare import WRENCH, Kernel, launch, launch_te
 from softmode.deformables.model.lane_kernels import LANES, WARP, team_size
 from softmode.deformables.model.layout import Layout, lay_out, lay_out_bases, lay_out_instances, surface_stiffness
 from softmode.deformables.model.namespaces import SoftModel, soft
+from softmode.deformables.model.newton_step_kernels import NewtonArrays, NewtonOptions, NewtonStep
 from softmode.deformables.model.rigid_dofs import RigidDofs
 from softmode.deformables.model.scaled_quantities import ScaledQuantities
 from softmode.deformables.model.struct_kernels import (
@@ -34,16 +35,15 @@ from softmode.deformables.model.struct_kernels import (
     Samples,
 )
 from softmode.deformables.model.tables import allocate
-from softmode.deformables.solver import fused_newton_kernels as fused
-from softmode.deformables.solver.assembly_cpu_kernels import cache_slabs
-from softmode.deformables.solver.factor import BlockCholesky
-from softmode.deformables.solver.fused_system_kernels import shared_bytes
-from softmode.deformables.solver.iteration_kernels import NewtonArrays, NewtonOptions, NewtonStep
-from softmode.deformables.solver.newton_round_kernels import BESIDE, LEVELS
+from softmode.deformables.newton import one_launch_kernels as fused
+from softmode.deformables.newton.round_kernels import BESIDE, LEVELS
+from softmode.deformables.potential.spin_kernels import Spin
 from softmode.deformables.solver.options import SolverReducedOptions
-from softmode.deformables.solver.spin_kernels import Spin
-from softmode.deformables.solver.systems import join_systems
-from softmode.deformables.solver.tile_kernels import TILE, chunk_count
+from softmode.deformables.system.assembly_cpu_kernels import cache_slabs
+from softmode.deformables.system.factor import BlockCholesky
+from softmode.deformables.system.shared_system_kernels import shared_bytes
+from softmode.deformables.system.systems import join_systems
+from softmode.deformables.system.tile_kernels import TILE, chunk_count
 
 CUDA_THREADS = 2**16
 """Threads that keep a GPU busy: sums over points are split until there are about so many."""
@@ -148,7 +148,7 @@ class StepTables:
     instance_force: wp.array
     """Contact force on every soft body [N], vec3d (instance_count,)."""
     parameter_flags: wp.array
-    """What :func:`softmode.deformables.solver.parameters.set_parameters` had to clamp, int (instance_count,)."""
+    """What :func:`softmode.deformables.tools.parameters.set_parameters` had to clamp, int (instance_count,)."""
     every_world: wp.array
     """The mask that selects all worlds, bool (world_count + 1,)."""
     team: int

@@ -20,7 +20,7 @@ from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.model.authoring import add_pins
 from softmode.deformables.model.namespaces import soft
 from softmode.deformables.model.tables import allocate
-from softmode.deformables.solver.reduced_solver import ReducedSolver, require_reduced
+from softmode.deformables.solver.solver_base import ReducedSolver, require_reduced
 from softmode.deformables.tools import grip_kernels as kernels
 from softmode.errors import ConfigError
 

@@ -26,7 +26,7 @@ from softmode.deformables.model.declare import launch
 from softmode.deformables.model.namespaces import soft
 from softmode.deformables.skinning.skin_splats import SkinSplats
 from softmode.deformables.skinning.skinning_kernels import vec6
-from softmode.deformables.solver.reduced_solver import ReducedSolver, require_reduced
+from softmode.deformables.solver.solver_base import ReducedSolver, require_reduced
 from softmode.deformables.tools import inverse_map_kernels as kernels
 from softmode.errors import ConfigError
 

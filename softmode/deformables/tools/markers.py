@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from softmode.deformables.solver.reduced_solver import ReducedSolver
+from softmode.deformables.solver.solver_base import ReducedSolver
 
 Array = NDArray[np.float64]
 

@@ -19,7 +19,7 @@ import warp as wp
 
 from softmode.deformables.model.tables import allocate, host
 from softmode.deformables.solver.attachments import Attachment
-from softmode.deformables.solver.reduced_solver import ReducedSolver, require_reduced
+from softmode.deformables.solver.solver_base import ReducedSolver, require_reduced
 from softmode.deformables.solver.step_view import StepView
 from softmode.deformables.tools import sensing_kernels as kernels
 from softmode.errors import ConfigError

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 
-from softmode.envs.tensors import Tensor, host_array, map_tree
 from softmode.errors import ConfigError, MissingExtraError
+from softmode.vector_check.tensors import Tensor, host_array, map_tree
 
 
 def missing(library: str, extra: str) -> MissingExtraError:

@@ -8,7 +8,7 @@ import gymnasium as gym
 from gymnasium.vector import VectorEnv
 
 from softmode.envs.adapters.common import checked_env, missing
-from softmode.envs.tensors import map_tree
+from softmode.vector_check.tensors import map_tree
 
 try:
     import torch

@@ -10,8 +10,8 @@ import numpy as np
 from gymnasium.vector import VectorEnv
 
 from softmode.envs.adapters.common import checked_env, infos_of_worlds, missing, to_numpy
-from softmode.envs.tensors import world_of
 from softmode.errors import ConfigError
+from softmode.vector_check.tensors import world_of
 
 try:
     from stable_baselines3.common.vec_env import VecEnv

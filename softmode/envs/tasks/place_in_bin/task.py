@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softmode.checks import require_fields, require_number, require_numbers
-from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.materials.material import Material
+from softmode.deformables.reduction.options import BuildOptions
 from softmode.envs.cameras import square_camera
 from softmode.envs.clutter import Arcs
 from softmode.envs.observation import Segment
@@ -28,7 +28,7 @@ from softmode.objects.config import ObjectConfig
 from softmode.robots.arm import ArmDescription
 from softmode.robots.control import ArmControlOptions
 from softmode.scenes.table_scene import Fixture, TableSceneConfig
-from softmode.splats.pinhole import PinholeCamera
+from softmode.splats.raster.pinhole import PinholeCamera
 
 CLEARANCE = 0.015
 """Between the rim and the bottom of what is carried over it [m]."""

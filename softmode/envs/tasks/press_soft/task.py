@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softmode.checks import require_fields, require_range
-from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.materials.material import Material
+from softmode.deformables.reduction.options import BuildOptions
 from softmode.envs.cameras import square_camera
 from softmode.envs.markers import sphere_marker
 from softmode.envs.observation import Segment
@@ -26,7 +26,7 @@ from softmode.robots.arm import ArmDescription
 from softmode.robots.control import ArmControlOptions
 from softmode.robots.table_robot import TableRobot, tip_length
 from softmode.scenes.table_scene import TableSceneConfig
-from softmode.splats.pinhole import PinholeCamera
+from softmode.splats.raster.pinhole import PinholeCamera
 from softmode.splats.splats import Splats
 
 THICKNESS = 0.04

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from softmode.checks import require_fields, require_number, require_range
-from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.materials.material import Material
+from softmode.deformables.reduction.options import BuildOptions
 from softmode.envs.clutter import Arcs
 from softmode.envs.markers import dots
 from softmode.envs.observation import Segment

@@ -26,7 +26,7 @@ from softmode.objects.task_objects import ROPE, ROPE_MATERIAL
 from softmode.robots.arm import ArmDescription
 from softmode.robots.control import ArmControlOptions
 from softmode.scenes.table_scene import Fixture, TableSceneConfig
-from softmode.splats.pinhole import PinholeCamera
+from softmode.splats.raster.pinhole import PinholeCamera
 from softmode.splats.splats import Splats
 
 LENGTH = 0.36

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from softmode.checks import require_fields, require_number, require_range
-from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.materials.material import Material
+from softmode.deformables.reduction.options import BuildOptions
 from softmode.envs.presets import RL_SOLVER
 from softmode.envs.task_config import TaskConfig
 from softmode.errors import ConfigError

@@ -1,0 +1,1 @@
+"""Energy, force and Hessian of a world at an iterate. It knows no schedule."""

@@ -1,0 +1,1 @@
+"""What fills an object: points with volumes, and samples of its surface."""

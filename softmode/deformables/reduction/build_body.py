@@ -1,0 +1,384 @@
+"""The build of a body: kernels, weights, orthonormal functions, cubature; and the names users import."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import sys
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from threadpoolctl import threadpool_limits
+
+from softmode.deformables.body.qgmls import BasisQGMLS
+from softmode.deformables.body.reduced_body import FORMAT_VERSION, ReducedBody, Scalar
+from softmode.deformables.body.regions import Region
+from softmode.deformables.body.rkpm import BasisRKPM
+from softmode.deformables.quadrature.octants import octants_of
+from softmode.deformables.quadrature.quadrature_grid import Quadrature
+from softmode.deformables.reduction.basis import BodyBasis, Domain, make_body_basis
+from softmode.deformables.reduction.cache import cache_directory, cached_body, fingerprint_of
+from softmode.deformables.reduction.cubature import Cubature, select_cubature
+from softmode.deformables.reduction.elastic_functions import SPACE_WARNING
+from softmode.deformables.reduction.kernel_visibility import lips_of, material_of
+from softmode.deformables.reduction.options import FUNCTION_COUNT, BuildOptions, HandleName
+from softmode.deformables.reduction.region_samples import longest_edge, pieces_near, refine_at_faces, sample_regions
+from softmode.deformables.reduction.sources import Sources, pack_sources
+from softmode.errors import MaterialError, memory_errors
+
+__all__ = [
+    "BuildOptions",
+    "HandleName",
+    "ReducedBody",
+    "Region",
+    "build_body",
+    "cache_directory",
+    "cached_body",
+    "fingerprint_of",
+]
+
+Array = NDArray[np.float64]
+Progress = Callable[[str, float], None]
+Field = ArrayLike | Callable[[Array], ArrayLike]
+"""One value per quadrature point, or a function of points (N, 3) [m] in asset coordinates."""
+
+FREE_VERSION = 3
+"""Version of the format since which bodies without regions are what they are: live recordings name them by it."""
+NU_LIMIT = 0.495
+"""Poisson's ratio from which on the default number of functions is said to be too small."""
+_PROGRESS = {"kernels": 0.1, "eigenmodes": 0.2, "responses": 0.35, "functions": 0.45, "cubature": 0.95, "surface": 1.0}
+"""Fraction of a build that is done after each stage."""
+
+
+def build_body(
+    quadrature: Quadrature,
+    options: BuildOptions | None = None,
+    *,
+    name: str = "body",
+    regions: Sequence[Region] = (),
+    stiffness_scale: Field | None = None,
+    density_scale: Field | None = None,
+    progress: bool | Progress | None = None,
+) -> ReducedBody:
+    """Reduce an object: kernels, weights, orthonormal functions, cubature.
+
+    Args:
+        quadrature: The object.
+        options: Sizes and seed; defaults when None.
+        name: Name for messages and reports.
+        regions: Parts that a scene holds, moves or grasps. Exact ones get weights of their own (one on the region,
+            zero on the others) and all other weights vanish there, so that holding them costs no accuracy; soft ones
+            enter the weights as springs. The more of a scene's supports are known here, the better the body bends.
+        stiffness_scale: Young's modulus relative to the body's: one value per quadrature point, shape (P,), or a
+            function that returns them (N,) for points (N, 3) of asset coordinates [m]; ones when None. A cell that a
+            jump cuts has the values of its points: means over the cell were worse (``docs/accuracy.md``).
+        density_scale: Density relative to any common reference, likewise; normalised to volume mean 1.
+        progress: True or False shows a bar or not; None shows one on a terminal when the build exceeds two seconds; a
+            callable receives (stage, fraction done).
+
+    Returns:
+        The body, in the frame of its centre of mass.
+
+    Raises:
+        MaterialError: If a scale is not finite and positive.
+        BasisError: If the basis cannot be built, or a region holds too few points or overlaps another.
+        ConfigError: If options do not fit the object, or regions share a name.
+    """
+    # One BLAS thread: the matrices are small, threads that compete for a busy core cost tenfold, and their number would
+    # decide the last bits of the result.
+    with threadpool_limits(limits=1, user_api="blas"):
+        return _build(
+            quadrature, options or BuildOptions(), name, tuple(regions), stiffness_scale, density_scale, progress
+        )
+
+
+def build_part(
+    quadrature: Quadrature,
+    options: BuildOptions,
+    *,
+    name: str,
+    regions: Sequence[Region],
+    stiffness_scale: Array | None,
+    density_scale: Array | None,
+    progress: bool | Progress | None,
+) -> ReducedBody:
+    """Reduce what a cut leaves, while someone waits: as `build_body`, with cubature points that come several at once.
+
+    Args:
+        quadrature: The part.
+        options: Those of the body that was cut.
+        name: Name for messages and reports.
+        regions: Regions that the part holds enough of.
+        stiffness_scale: Relative Young's modulus, shape (P,), or None.
+        density_scale: Relative density, likewise.
+        progress: As for `build_body`.
+    """
+    given = tuple(regions)
+    with threadpool_limits(limits=1, user_api="blas"):
+        return _build(quadrature, options, name, given, stiffness_scale, density_scale, progress, quick=True)
+
+
+@memory_errors("building a body", hint="take fewer kernels, points or functions")
+def _build(
+    quadrature: Quadrature,
+    options: BuildOptions,
+    name: str,
+    regions: tuple[Region, ...],
+    stiffness_scale: Field | None,
+    density_scale: Field | None,
+    progress: bool | Progress | None,
+    *,
+    quick: bool = False,
+) -> ReducedBody:
+    """Do what :func:`build_body` and :func:`build_part` say."""
+    start = time.perf_counter()
+    stiffness = positive_field("stiffness_scale", stiffness_scale, quadrature.points)
+    density = positive_field("density_scale", density_scale, quadrature.points)
+    fingerprint = body_fingerprint(quadrature, options, name, regions, stiffness, density)
+    sources = Sources(
+        quadrature=quadrature,
+        options=options,
+        regions=regions,
+        stiffness_scale=None if stiffness_scale is None else stiffness,
+        density_scale=None if density_scale is None else density,
+    )
+    pieces = pieces_near(quadrature, regions)
+    places, weights = pieces.points, pieces.weights
+    stiffness, density = stiffness[pieces.parent], density[pieces.parent]
+    density = density * (quadrature.volume / (weights @ density))
+    mass = weights * density / quadrature.volume
+    offset = mass @ places
+    seeds, bounds = places - offset, quadrature.bounds - offset
+    length = float(np.sqrt(mass @ (seeds**2).sum(axis=1)))
+    regions = tuple(region.moved(offset, bounds) for region in regions)
+    samples = sample_regions(regions, pieces, offset, stiffness, quadrature.spacing)
+    points, volumes, parent = refine_at_faces(regions, pieces, offset)
+    stiffness = stiffness[parent]
+    seconds: dict[str, float] = {}
+    with _reporter(progress, name) as report:
+
+        def stage(label: str) -> None:
+            seconds[label] = time.perf_counter() - start - sum(seconds.values())
+            report(label, _PROGRESS[label])
+
+        basis = make_body_basis(
+            Domain(
+                points=points,
+                volumes=volumes,
+                stiffness=stiffness,
+                density=density[parent],
+                seeds=seeds,
+                spacing=quadrature.spacing,
+                edge=longest_edge(quadrature),
+                length=length,
+                regions=regions,
+                samples=samples,
+                added=np.reshape([np.append(*pair) for pair in options.add_kernels], (-1, 4)) - np.append(offset, 0.0),
+                material=None if quadrature.cells is None else material_of(quadrature.cells, offset),
+                octants=None if quadrature.cells is None else octants_of(quadrature.cells, offset),
+                lips=lips_of(quadrature.cells) - offset,
+            ),
+            options,
+            stage,
+            quick=quick,
+        )
+        if not quick:
+            _warn_of_stiffness(name, basis, options)
+        chosen = _cubature(volumes, basis, stiffness, options, quick=quick)
+        stage("cubature")
+        function_count = basis.gradient.shape[1]
+        cores = [region.cores for region in regions]
+        body = ReducedBody(
+            name=name,
+            points=points[chosen.index],
+            weights=chosen.weights,
+            grad_basis=basis.gradient[chosen.index].astype(np.float32),
+            stiffness_scale=stiffness[chosen.index],
+            surface_points=quadrature.surface_points - offset,
+            surface_normals=quadrature.surface_normals.copy(),
+            surface_areas=quadrature.surface_areas.copy(),
+            surface_basis=np.zeros((len(quadrature.surface_points), function_count), dtype=np.float32),
+            volume=quadrature.volume,
+            mean_basis=basis.functions.mean,
+            linear_coordinates=basis.functions.linear,
+            eigenvalues=basis.eigenvalues,
+            bounds=bounds,
+            offset=offset,
+            centres=basis.kernels.centres,
+            radii=basis.kernels.radii,
+            kernel=options.kernel if isinstance(basis.kernels, BasisRKPM) else "qgmls",
+            handles=basis.weights.coefficients,
+            handle_degrees=basis.weights.degrees,
+            handle_regions=basis.weights.blends,
+            transform=basis.functions.transform,
+            length=length,
+            driven_count=basis.functions.driven_count,
+            envelope_length=basis.envelope_length,
+            region_names=tuple(region.name for region in regions),
+            region_stiffness=np.array([region.stiffness or 0.0 for region in regions], dtype=np.float64),
+            region_radii=np.array([region.radius for region in regions], dtype=np.float64),
+            region_cores=np.concatenate([np.zeros((0, 2, 3)), *cores]),
+            core_index=np.repeat(np.arange(len(regions), dtype=np.int64), [len(core) for core in cores]),
+            region_points=samples.points,
+            region_index=samples.index,
+            region_weights=samples.weights,
+            drive=basis.drive,
+            drive_affine=basis.drive_affine,
+            fingerprint=fingerprint,
+            provenance={},
+            build_seconds=0.0,
+            sources=pack_sources(sources),
+            **_bounded(basis.kernels),
+        )
+        surface = body.evaluate(body.surface_points)[0]
+        stage("surface")
+    provenance: dict[str, Scalar] = {
+        **{f"quadrature_{key}": v for key, v in quadrature.report.items() if isinstance(v, str | int | float | bool)},
+        **{f"option_{key}": _scalar(v) for key, v in dataclasses.asdict(options).items()},
+        **{f"seconds_{key}": v for key, v in seconds.items()},
+        "quadrature_count": len(points),
+        "function_count": function_count,
+        "dropped_functions": 0 if options.chosen else len(basis.functions.transform) - function_count,
+        **basis.report,
+        "heterogeneous": stiffness_scale is not None or density_scale is not None,
+        "cubature_count": len(chosen.index),
+        "cubature_force_error": chosen.force_error,
+        "cubature_stiffness_error": chosen.stiffness_error,
+        "soft_mode_error": chosen.soft_mode_error,
+        **{f"cubature_force_error_{size}": error for size, error in chosen.trade_off.items()},
+    }
+    return dataclasses.replace(
+        body,
+        surface_basis=surface.astype(np.float32),
+        provenance=provenance,
+        build_seconds=time.perf_counter() - start,
+    )
+
+
+def _warn_of_stiffness(name: str, basis: BodyBasis, options: BuildOptions) -> None:
+    """Say what makes a body too stiff.
+
+    Warns:
+        RuntimeWarning: If its kernels do not resolve it, or its Poisson's ratio wants more functions.
+    """
+    space, ratio = basis.report.get("space_error", 0.0), max(options.poissons_ratios)
+    if space > SPACE_WARNING:
+        warnings.warn(
+            f"body {name!r}: space_error {100.0 * space:.0f} %: its first six frequencies may be that much too high, by"
+            " corners, branches or thin walls that its kernels do not resolve; build it with twice the points",
+            RuntimeWarning,
+            stacklevel=4,
+        )
+    if options.chosen and ratio > NU_LIMIT and (options.function_count or FUNCTION_COUNT) <= FUNCTION_COUNT:
+        warnings.warn(
+            f"body {name!r}: {FUNCTION_COUNT} functions are up to 4 % too stiff at nu = {ratio:g};"
+            " give function_count=80",
+            RuntimeWarning,
+            stacklevel=4,
+        )
+
+
+def body_fingerprint(
+    quadrature: Quadrature,
+    options: BuildOptions,
+    name: str,
+    regions: Sequence[Region],
+    stiffness: Array,
+    density: Array,
+) -> str:
+    """Return the fingerprint of all that a body is built from; stiffness and density are relative, one per point."""
+    version = FORMAT_VERSION if regions else FREE_VERSION
+    return fingerprint_of(version, quadrature, options, name, list(regions), stiffness, density)
+
+
+def _cubature(volumes: Array, basis: BodyBasis, stiffness: Array, options: BuildOptions, *, quick: bool) -> Cubature:
+    """Choose cubature points: fitted to more poses, or more than asked for, where forces of held-out poses want that.
+
+    If none errs as little as was asked for, it is the one that errs least. A quick choice is the first one.
+
+    Warns:
+        RuntimeWarning: If these forces still err by more than was asked for.
+    """
+    trials = options.cubature_trials(len(volumes))[: 1 if quick else None]
+    best = None
+    for count, poses in trials:
+        found = select_cubature(
+            volumes,
+            basis.gradient,
+            count,
+            stiffness_scale=stiffness,
+            driven_count=basis.functions.driven_count,
+            pose_count=poses,
+            seed=options.seed,
+            quick=quick,
+        )
+        if options.cubature_error is None or found.force_error <= options.cubature_error:
+            return found
+        if best is None or found.force_error < best.force_error:
+            best = found
+    assert best is not None  # There is a first trial.
+    if len(trials) > 1:
+        warnings.warn(
+            f"cubature_error: {len(best.index)} points leave {best.force_error:.2g}, "
+            f"{options.cubature_error:g} was asked for; give a larger cubature_count",
+            RuntimeWarning,
+            stacklevel=4,
+        )
+    return best
+
+
+def _bounded(kernels: BasisRKPM | BasisQGMLS) -> dict[str, NDArray]:
+    """Return the fields of a body whose kernels do not act across gaps, or whose distances are not straight lines."""
+    found: dict[str, NDArray] = {}
+    if isinstance(kernels, BasisRKPM) and kernels.visibility is not None:
+        found |= {"material_points": kernels.visibility.points, "hidden_pairs": kernels.visibility.hidden}
+    if isinstance(kernels, BasisRKPM) and kernels.detours is not None:
+        table = kernels.detours
+        found |= {"material_points": table.points, "material_frame": table.frame}
+        found |= {"detour_pairs": table.pairs, "detour_lengths": table.lengths}
+    return found
+
+
+def _scalar(value: Scalar | tuple[object, ...]) -> Scalar:
+    """Return an option as the header of a file holds it."""
+    if not isinstance(value, tuple):
+        return value
+    return " ".join(str(_scalar(v)) if isinstance(v, tuple) else f"{v:g}" for v in value)
+
+
+def positive_field(name: str, value: Field | None, points: Array) -> Array:
+    """Return a field's values at points (P, 3), shape (P,)."""
+    if value is None:
+        return np.ones(len(points))
+    found = np.array(value(points) if callable(value) else value, dtype=np.float64)
+    if found.shape != (len(points),):
+        raise MaterialError(
+            f"{name}: expected one value per quadrature point, shape ({len(points)},), got {found.shape}"
+        )
+    if not (np.isfinite(found).all() and (found > 0.0).all()):
+        bad = int(np.flatnonzero(~(np.isfinite(found) & (found > 0.0)))[0])
+        raise MaterialError(f"{name}: expected finite values > 0, got {found[bad]} at row {bad}")
+    return found
+
+
+@contextlib.contextmanager
+def _reporter(progress: bool | Progress | None, name: str) -> Iterator[Progress]:
+    if callable(progress):
+        yield progress
+        return
+    shown = progress if progress is not None else sys.stderr.isatty()
+    if not shown:
+        yield lambda stage, fraction: None
+        return
+    from tqdm import tqdm
+
+    with tqdm(total=100, desc=f"build {name}", delay=0.0 if progress else 2.0, unit="%", leave=False) as bar:
+
+        def report(stage: str, fraction: float) -> None:
+            bar.set_postfix_str(stage, refresh=False)
+            bar.update(round(100.0 * fraction) - bar.n)
+
+        yield report

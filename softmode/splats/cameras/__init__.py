@@ -1,0 +1,1 @@
+"""Cameras that draw deforming splats, meshes, light and shadow."""

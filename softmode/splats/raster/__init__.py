@@ -1,0 +1,1 @@
+"""The batched rasteriser of splats, and its derivative."""
