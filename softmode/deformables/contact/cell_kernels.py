@@ -75,7 +75,7 @@ class CellShape:
     width: wp.float64  # L [m]
     bend: wp.float64  # b [m]
     least: wp.float64  # e_0 [m]
-    steepest: wp.float64  # bound of t: twice the margin within which contacts are found [m]
+    steepest: wp.float64  # range by tilt beyond which a cell counts as level: the margin of detection [m]
     fade: wp.float64  # that of a level and flat cell [m]
 
 
@@ -90,7 +90,7 @@ def shape_of_cell(surface: Surface, instances: Instances, basis: Basis, i: int, 
     bend = wp.float64(s * s) * area * wp.float64(surface.curvature[row] / s + other) / (wp.float64(2.0) * PI)
     shape.bend = wp.max(bend, wp.float64(0.0))
     shape.least = wp.float64(instances.smoothing[i] / surface.slenderness[row])
-    shape.steepest = wp.float64(2.0 * instances.margin[i])
+    shape.steepest = wp.float64(instances.margin[i])
     shape.fade = wp.float64(FADE * instances.size[i])
     return shape
 
@@ -105,7 +105,7 @@ def lean_of(shape: CellShape, F: wp.mat33d, n: wp.vec3d):
         return wp.vec3d()
     lean = shape.width * (pull + facing * shape.normal)
     share = wp.length_sq(lean) / (shape.steepest * shape.steepest)
-    return lean / wp.sqrt(wp.sqrt(one + share * share))
+    return lean / (one + share * share)
 
 
 @wp.func
@@ -126,7 +126,7 @@ def cell_at(shape: CellShape, F: wp.mat33d, n: wp.vec3d, gap: wp.float64, closin
     half = wp.float64(0.5)
     zero = wp.float64(0.0)
     lean = ratio / (wp.float64(1.0) + ratio) * lean_of(shape, F, n)
-    if gap > half * shape.steepest:
+    if gap > shape.steepest:
         lean = wp.vec3d()
     tilt = wp.length(lean)
     cell = Cell()

@@ -23,6 +23,7 @@ from softmode.deformables.contact.cell_kernels import (
 )
 from softmode.deformables.contact.penalty_kernels import (
     BULK_FACTOR,
+    HARDENING_DEPTH,
     SHEAR_FACTOR,
     dent_compliance,
     dent_depth,
@@ -617,7 +618,7 @@ def gather_contacts(
         constraints.stiffness[i, e] = stiffness
         constraints.dent_compliance[i, e] = compliance
         depth = dent_depth(instances, i, surface.dent_length[row], edged)
-        constraints.dent_depth[i, e] = wp.float64(spared * depth)
+        constraints.dent_depth[i, e] = wp.float64(spared * depth) + HARDENING_DEPTH * cell_shape.least
         constraints.partner_row[i, e] = row
         if wp.length_sq(cell.centre) > wp.float64(0.0):
             constraints.row[i, e] = surface.first_row + i * surface.row_max + e

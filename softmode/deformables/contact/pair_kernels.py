@@ -35,6 +35,7 @@ from softmode.deformables.contact.cell_kernels import (
 from softmode.deformables.contact.detection_kernels import rank_contacts
 from softmode.deformables.contact.penalty_kernels import (
     BULK_FACTOR,
+    HARDENING_DEPTH,
     SHEAR_FACTOR,
     dent_compliance,
     dent_depth,
@@ -577,7 +578,7 @@ def write_pairs(
             constraints.stiffness[a, e] = stiffness
             constraints.stick[a, e] = stick
             constraints.dent_compliance[a, e] = compliance
-            constraints.dent_depth[a, e] = wp.float64(depth)
+            constraints.dent_depth[a, e] = wp.float64(depth) + HARDENING_DEPTH * mine.least
             constraints.onset[a, e] = cell.onset
             constraints.lead[a, e] = cell.lead
             constraints.friction[a, e] = friction

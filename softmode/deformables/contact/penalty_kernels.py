@@ -45,7 +45,9 @@ HARDENING = wp.constant(wp.float64(9.0))
 """Stiffness that contact gains where it is deep, over that where it is not: what an arm presses with its full force
 sinks in 1.4 to 2.4 mm instead of 7 to 8. Ten times the stiffness throughout costs light bodies momentum."""
 HARDENING_DEPTH = wp.constant(wp.float64(2.0))
-"""Penetration beyond which it does, in ranges of the onset."""
+"""Penetration beyond which it does besides the dent, in ranges of the onset of a level face."""
+HARDENING_RANGE = wp.constant(wp.float64(2.0))
+"""Range of the onset of what it gains, in ranges of the contact's onset."""
 
 
 @wp.func
@@ -74,8 +76,7 @@ def normal_potential(penetration: wp.float64, eps: wp.float64, ratio: wp.float64
     """
     share = wp.float64(1.0) / (wp.float64(1.0) + ratio)
     psi, slope, curvature = penalty(penetration, eps)
-    deep = HARDENING_DEPTH * eps
-    psi_deep, slope_deep, curvature_deep = penalty(penetration - depth - deep, deep)
+    psi_deep, slope_deep, curvature_deep = penalty(penetration - depth, HARDENING_RANGE * eps)
     return (
         share * psi + HARDENING * psi_deep,
         share * slope + HARDENING * slope_deep,

@@ -29,6 +29,7 @@ from softmode.deformables.contact.penalty_kernels import (
     BULK_FACTOR,
     HARDENING,
     HARDENING_DEPTH,
+    HARDENING_RANGE,
     dent_exponents,
     penalty,
     stiffness_exponents,
@@ -128,14 +129,14 @@ def accumulate_cells(
     eps = constraints.onset[i, e]
     depth = constraints.dent_depth[i, e]
     p = -wp.dot(n, constraints.offset[i, e] + constraints.displacement[i, e])
-    deep = HARDENING_DEPTH * eps
+    deep = HARDENING_RANGE * eps
     ratio = k * constraints.dent_compliance[i, e]
     share = wp.float64(1.0) / (wp.float64(1.0) + ratio)
     _psi, _slope, curvature = penalty(p, eps)
-    _deep_psi, _deep_slope, deep_curvature = penalty(p - depth - deep, deep)
+    _deep_psi, _deep_slope, deep_curvature = penalty(p - depth, deep)
     steep = HARDENING * deep_curvature
     force_bar = k * step.normal_bar[i, e][0]
-    onset_bar = HARDENING_DEPTH * (HARDENING * by_onset(p - depth - deep, deep) - steep)
+    onset_bar = HARDENING_RANGE * HARDENING * by_onset(p - depth, deep)
     onset_bar = force_bar * (onset_bar + share * by_onset(p, eps))
     lead_bar = force_bar * (share * curvature + steep)
     depth_bar = -force_bar * steep * depth
@@ -177,7 +178,8 @@ def accumulate_cells(
     by_log = by_ratio * ratio
     spared_bar = zero
     if spared > zero:
-        spared_bar = (step.normal_bar[i, e][1] + depth_bar + by_log) / spared
+        own = depth_bar + force_bar * steep * HARDENING_DEPTH * cell_shape.least  # less the part that no dent shifts
+        spared_bar = (step.normal_bar[i, e][1] + own + by_log) / spared
     step.cell_spared[i, e] = spared_bar
     fade_bar = spared_bar * by_fade
     step.cell_gradient[i, e] = by_F + fade_bar * fade_F + along * wp.outer(n, cell.centre)
