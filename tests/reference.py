@@ -201,8 +201,8 @@ def dented_penalty(penetration: np.ndarray, eps: float, ratio: float) -> np.ndar
 
 
 def normal_potential(penetration: np.ndarray, eps: float, ratio: float = 0.0, depth: float = 0.0) -> np.ndarray:
-    """Return the contact potential per unit stiffness: a dented penalty, one nine times as stiff from depth + 2 eps."""
-    return dented_penalty(penetration, eps, ratio) + 9.0 * penalty(penetration - depth - 2.0 * eps, 2.0 * eps)
+    """Return the contact potential per unit stiffness: a dented penalty, one nine times as stiff from ``depth`` on."""
+    return dented_penalty(penetration, eps, ratio) + 9.0 * penalty(penetration - depth, 2.0 * eps)
 
 
 def friction_potential(y: np.ndarray, eps: float) -> np.ndarray:

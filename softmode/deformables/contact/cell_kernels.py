@@ -39,6 +39,9 @@ FACING = wp.constant(wp.float64(0.2))
 LATE = wp.constant(wp.float64(0.15))
 """Share of e_0 by which a contact begins later than half its range outside: a face that rides in its onset then stands,
 from 1 to 10 % of strain, within 1 % of where it should."""
+NEAR = wp.constant(wp.float64(0.35))
+"""Share of the margin of detection beyond which a cell is level and nothing around it counts, as it cannot touch but by
+an impact: what flies past a shape must not feel that it might lean against it."""
 LEVEL = wp.constant(wp.float64(1.0e-3))
 """Range by tilt over e_0 below which a cell is level."""
 
@@ -126,7 +129,7 @@ def cell_at(shape: CellShape, F: wp.mat33d, n: wp.vec3d, gap: wp.float64, closin
     half = wp.float64(0.5)
     zero = wp.float64(0.0)
     lean = ratio / (wp.float64(1.0) + ratio) * lean_of(shape, F, n)
-    if gap > shape.steepest:
+    if gap > NEAR * shape.steepest:
         lean = wp.vec3d()
     tilt = wp.length(lean)
     cell = Cell()

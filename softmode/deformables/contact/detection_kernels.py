@@ -11,6 +11,7 @@ contact records are appended by an atomic counter: fixed slots per sample keep t
 import warp as wp
 
 from softmode.deformables.contact.cell_kernels import (
+    NEAR,
     Surface,
     ahead_of,
     cell_at,
@@ -558,11 +559,16 @@ def gather_contacts(
         # of unit length in float64: what is left of the gap in the slip must not count against the stick range
         normal = wp.normalize(wp.vec3d(samples.normal[i, s, slot]))
         cell_shape = shape_of_cell(surface, instances, basis, i, row, curvature_of(shapes, shape, normal))
-        start = gradient_of(instances, basis, motion.q_start, i, row)
-        ahead, closing = ahead_of(instances, basis, motion, start, normal, i, row, dt)
-        closing -= wp.dot(normal, wp.vec3d(shape_drift(shapes, shape, wp.vec3(samples.position[i, s]), dt)))
-        fade = fade_of(cell_shape, ahead, normal)
-        spared = float(spared_share(surface, samples.shape, samples.gap, cell_shape, fade, i, row, shape))
+        start = wp.mat33d()
+        ahead = wp.mat33d()
+        closing = wp.float64(0.0)
+        spared = float(1.0)
+        if gap <= NEAR * cell_shape.steepest:
+            start = gradient_of(instances, basis, motion.q_start, i, row)
+            ahead, closing = ahead_of(instances, basis, motion, start, normal, i, row, dt)
+            closing -= wp.dot(normal, wp.vec3d(shape_drift(shapes, shape, wp.vec3(samples.position[i, s]), dt)))
+            fade = fade_of(cell_shape, ahead, normal)
+            spared = float(spared_share(surface, samples.shape, samples.gap, cell_shape, fade, i, row, shape))
         area = wp.max(sample_area(instances.scale[i], basis.row_area[row]), 1.0e-30)
         relative = surface.relative_stiffness[row]
         partner_mass = float(0.0)

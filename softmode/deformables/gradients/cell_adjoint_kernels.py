@@ -12,6 +12,7 @@ x_bar = -dL/dx, the last of the offset, which leaves out what T closes by turnin
 import warp as wp
 
 from softmode.deformables.contact.cell_kernels import (
+    NEAR,
     PI,
     CellShape,
     Surface,
@@ -163,7 +164,9 @@ def accumulate_cells(
     fade_shape, fade_F, _fade_n = wp.grad(fade_of)(cell_shape, ahead, n)
     cell = cell_at(cell_shape, ahead, n, gap, closing, ratio)
     fade = fade_of(cell_shape, ahead, n)
-    spared = spared_share(surface, samples.shape, samples.gap, cell_shape, fade, i, row, shape)
+    spared = zero  # or one, far away: either does not change
+    if gap <= NEAR * cell_shape.steepest:
+        spared = spared_share(surface, samples.shape, samples.gap, cell_shape, fade, i, row, shape)
     by_gap = zero
     by_fade = zero
     for m in range(surface.start[row], surface.start[row + 1]):
