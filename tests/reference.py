@@ -220,7 +220,7 @@ def contact_stiffness(
 ) -> float:
     """Return the automatic contact stiffness per area [Pa/m].
 
-    The largest of 300 M / L (P-wave modulus over size), 100 m_eff / (A dt^2) with 1/m_eff = 1/m + 1/m_partner and A the
+    The largest of 150 M / L (P-wave modulus over size), 100 m_eff / (A dt^2) with 1/m_eff = 1/m + 1/m_partner and A the
     smaller surface, and 1e8.
     """
     E, nu = material.youngs_modulus, material.poissons_ratio
@@ -228,7 +228,7 @@ def contact_stiffness(
     size = float(np.linalg.norm(np.ptp(body.bounds, axis=0)))
     mass = 1.0 / (1.0 / (material.density * body.volume) + 1.0 / partner_mass)
     area = min(float(body.surface_areas.sum()), partner_area)
-    return max(300.0 * wave / size, 100.0 * mass / (area * dt**2), 1.0e8)
+    return max(150.0 * wave / size, 100.0 * mass / (area * dt**2), 1.0e8)
 
 
 def distance_plane(x: np.ndarray) -> np.ndarray:

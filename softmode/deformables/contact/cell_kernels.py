@@ -39,9 +39,11 @@ FACING = wp.constant(wp.float64(0.2))
 LATE = wp.constant(wp.float64(0.15))
 """Share of e_0 by which a contact begins later than half its range outside: a face that rides in its onset then stands,
 from 1 to 10 % of strain, within 1 % of where it should."""
-NEAR = wp.constant(wp.float64(0.35))
-"""Share of the margin of detection beyond which a cell is level and nothing around it counts, as it cannot touch but by
+NEAR = wp.constant(wp.float64(0.5))
+"""Share of that bound, as a gap, beyond which a cell is level and nothing around it counts, as it cannot touch but by
 an impact: what flies past a shape must not feel that it might lean against it."""
+TURNING = wp.constant(wp.float64(9.0))
+"""Square of the dent, in penalties, with which a cell turns half of its way."""
 LEVEL = wp.constant(wp.float64(1.0e-3))
 """Range by tilt over e_0 below which a cell is level."""
 
@@ -56,7 +58,7 @@ class Surface:
     curvature: wp.array[float]  # mean curvature of the asset at rest [1/m]
     start: wp.array[int]  # (sample_total + 1,), where each sample's neighbourhood begins in
     neighbour: wp.array[int]  # samples, counted within their body, and
-    weight: wp.array[float]  # their weights, of sum one
+    weight: wp.array[float]  # their weights, of sum ``CARRIED``
     first_row: int  # of the rows at centres of pressure
     row_max: int  # such rows of an instance
 
@@ -78,7 +80,7 @@ class CellShape:
     width: wp.float64  # L [m]
     bend: wp.float64  # b [m]
     least: wp.float64  # e_0 [m]
-    steepest: wp.float64  # range by tilt beyond which a cell counts as level: the margin of detection [m]
+    steepest: wp.float64  # range by tilt beyond which a cell counts as level again, most of the margin of detection [m]
     fade: wp.float64  # that of a level and flat cell [m]
 
 
@@ -93,7 +95,7 @@ def shape_of_cell(surface: Surface, instances: Instances, basis: Basis, i: int, 
     bend = wp.float64(s * s) * area * wp.float64(surface.curvature[row] / s + other) / (wp.float64(2.0) * PI)
     shape.bend = wp.max(bend, wp.float64(0.0))
     shape.least = wp.float64(instances.smoothing[i] / surface.slenderness[row])
-    shape.steepest = wp.float64(instances.margin[i])
+    shape.steepest = wp.float64(0.7 * instances.margin[i])
     shape.fade = wp.float64(FADE * instances.size[i])
     return shape
 
@@ -128,7 +130,7 @@ def cell_at(shape: CellShape, F: wp.mat33d, n: wp.vec3d, gap: wp.float64, closin
     """
     half = wp.float64(0.5)
     zero = wp.float64(0.0)
-    lean = ratio / (wp.float64(1.0) + ratio) * lean_of(shape, F, n)
+    lean = ratio * ratio / (TURNING + ratio * ratio) * lean_of(shape, F, n)
     if gap > NEAR * shape.steepest:
         lean = wp.vec3d()
     tilt = wp.length(lean)

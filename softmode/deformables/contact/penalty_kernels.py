@@ -30,9 +30,9 @@ from softmode.deformables.model.struct_kernels import (
 
 wp.set_module_options({"enable_backward": False})
 
-BULK_FACTOR = wp.constant(300.0)
+BULK_FACTOR = wp.constant(150.0)
 """Contact stiffness per area over P-wave modulus per size: under a pressure that squeezes a body by 10 %, contact sinks
-by 0.033 % of its size. The dent gives way, the penalty only keeps surfaces apart."""
+by 0.067 % of its size. The dent gives way, the penalty only keeps surfaces apart."""
 SHEAR_FACTOR = wp.constant(40.0)
 """The same of the spring of friction: with 400 stiff bodies that hit the ground hop between sticking and sliding (40
 iterations instead of 11 at 1e9 Pa)."""
