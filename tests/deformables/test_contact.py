@@ -151,12 +151,14 @@ def stiffness_per_area(scene, instance=0):
 def test_stiffness_and_size_of_the_penalty():
     """At rest under a pressure P = m g / A a face sinks x with kappa (x - eps / 2) = P, or kappa x^2 / (2 eps).
 
-    Of the onset 0.35 lie outside, and a face that touches as a whole has no dents.
+    Of the onset 0.35 lie outside. A face that touches as a whole has 2 % of its dents, in series with the penalty.
     """
     material = Material(youngs_modulus=1.0e7, mass_damping=5.0)
     scene = on_shape(lambda w: w.add_ground_plane(), height=0.0, material=material)
     settle(scene, 400)
-    kappa = stiffness_per_area(scene)
+    held, contacts = scene.reduced.view.constraints, slice(0, int(scene.reduced.view.constraints.count.numpy()[0]))
+    ratio = (held.stiffness.numpy() * held.dent_compliance.numpy())[0, contacts].min()
+    kappa = stiffness_per_area(scene) / (1.0 + ratio)
     eps = float(scene.reduced.view.instances.smoothing.numpy()[0])
     pressure = scene.mass() * GRAVITY / EDGE**2
     p = np.sqrt(2 * eps * pressure / kappa)
@@ -165,13 +167,13 @@ def test_stiffness_and_size_of_the_penalty():
     depth = -scene.state.particle_q.numpy()[bottom, 2].astype(float)
     # E = 10 MPa is stiff but not rigid, and the areas of the samples sum to the face's only on average.
     areas, dents = scene.body().surface_areas[bottom], scene.state.softmode.dent.numpy()[bottom, 2]
-    assert np.average(depth, weights=areas) + 0.35 * eps == pytest.approx(p, rel=0.1)
-    assert np.abs(dents).max() < 1.0e-9
+    assert np.average(depth + dents, weights=areas) + 0.35 * eps == pytest.approx(p, rel=0.1)
+    assert 0.0 < ratio < 0.02 * 30.0 and np.abs(dents).max() < 0.3 * p
 
 
 @pytest.mark.parametrize("dt", [0.004, 0.0005], ids=["bulk", "inertia"])
 def test_automatic_stiffness_follows_the_parameters(dt):
-    """Largest of 400 M / L, 100 m / (A dt^2) and 1e8 per world, from what the model holds when a graph is replayed."""
+    """Largest of 150 M / L, 100 m / (A dt^2) and 1e8 per world, from what the model holds when a graph is replayed."""
     scene = on_shape(lambda w: w.add_ground_plane(), height=-1e-4, world_count=2, dt=dt)
     replay = scene.capture()
     body, first = cube(), Material()
