@@ -5,8 +5,9 @@ that cell, which tilt and curvature spread evenly over a range e, the *onset* (s
 n of what is touched, the rest normal N and F of the body a step's velocity ahead,
 
     m = P_N F^T n                               slope of the gap over the cell
-    t = |m| L r/(1 + r),  L = sqrt(3 A / pi)    range by tilt: that of a strip with the variance of a disc of area A;
-                                                r: compliance of the dent over that of the penalty
+    x = |m| L,  L = sqrt(3 A / pi)              range of a strip with the variance of a disc of area A
+    t = x / (1 + (x/a)^4) r^2/(9 + r^2)         range by tilt, none of a steep cell; r: compliance of the dent over that
+                                                of the penalty, a: ``steepest``
     b = A (H + H_other) / (2 pi)                range by the mean curvatures of both: exact for a sphere
     e = sqrt(e_0^2 + t^2 + b^2)                 e_0: ``contact_smoothing``
     q = e/2 - gap - b/2 - 0.15 e_0              penetration, a step's velocity ahead
