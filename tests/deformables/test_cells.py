@@ -135,7 +135,7 @@ def test_balls_roll_down(modulus: float, degrees: float, seconds: float, error: 
 
 
 def test_tables() -> None:
-    """Neighbourhoods weigh to what functions carry and face one way, a ball has the curvature 1/R, a sheet has room for both sides."""
+    """Neighbourhoods face one way and weigh what functions carry, a ball has the curvature 1/R, a sheet two sides."""
     body = smooth_ball(8, 400)
     np.testing.assert_allclose(np.median(mean_curvature(body)), 1.0 / 0.05, rtol=0.02)
     assert np.abs(mean_curvature(cube())).max() < 1.0e-9
