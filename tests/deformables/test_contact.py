@@ -49,7 +49,7 @@ def test_mesh_contact_is_not_lost_when_deep():
 
 @pytest.mark.parametrize("ratio, depth", [(0.0, 0.0), (0.3, 1.0e-3), (40.0, 4.0e-3)])
 def test_potentials(ratio, depth):
-    """psi_n equals p^3/(6 eps), p^2/2 - eps p/2 + eps^2/6 and a stiffer one from a depth on, C2; psi_t IPC's eq. (13)."""
+    """psi_n is p^3/(6 eps), p^2/2 - eps p/2 + eps^2/6 and a stiffer one from a depth on, C2; psi_t IPC's eq. (13)."""
     eps, step = 1.0e-3, 1.0e-9
     x = np.concatenate([np.linspace(-eps, 12 * eps, 501), [0.0, eps, 0.5 * eps]])
 
