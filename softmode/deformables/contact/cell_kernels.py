@@ -81,7 +81,9 @@ class CellShape:
     width: wp.float64  # L [m]
     bend: wp.float64  # b [m]
     least: wp.float64  # e_0 [m]
-    steepest: wp.float64  # range by tilt beyond which a cell counts as level again, most of the margin of detection [m]
+    steepest: (
+        wp.float64
+    )  # range by tilt beyond which a cell counts as level again: most of the margin, thinner of a thin body [m]
     fade: wp.float64  # that of a level and flat cell [m]
 
 
@@ -96,7 +98,7 @@ def shape_of_cell(surface: Surface, instances: Instances, basis: Basis, i: int, 
     bend = wp.float64(s * s) * area * wp.float64(surface.curvature[row] / s + other) / (wp.float64(2.0) * PI)
     shape.bend = wp.max(bend, wp.float64(0.0))
     shape.least = wp.float64(instances.smoothing[i] / surface.slenderness[row])
-    shape.steepest = wp.float64(0.7 * instances.margin[i])
+    shape.steepest = wp.float64(0.7 * instances.margin[i] / surface.slenderness[row])
     shape.fade = wp.float64(FADE * instances.size[i])
     return shape
 
