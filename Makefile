@@ -74,8 +74,10 @@ resolve: $(VENV)/.created  ## check that all extras resolve to wheels on every s
 	    --no-header --no-annotate pyproject.toml | wc -l | sed 's/$$/ packages/'; \
 	done
 
-demo: $(VENV)/.demo  ## play the scripted lift and write out/lift.mp4
-	$(BIN)/softmode play softmode/LiftSoft-v0 --policy scripted --video out/lift.mp4 $(ARGS)
+# Wool as soft as foam, and as heavy as when it is wet: it gives way between the fingers and swings.
+DEMO := --object glove --youngs-modulus 3e4 --density 400
+demo: $(VENV)/.demo  ## play the scripted lift of a soft glove and write out/lift.mp4
+	$(BIN)/softmode play softmode/LiftSoft-v0 $(DEMO) --video out/lift.mp4 $(ARGS)
 
 # All cores compile an environment's kernels at once, before the processes of a run wait for each other's.
 $(WARP_CACHE_PATH): | $(VENV)/.dev
@@ -117,7 +119,7 @@ $(VENV)/.bench: $(VENV)/.dev
 
 accuracy: $(VENV)/.bench  ## the tables and the picture of docs/accuracy.md
 	$(BIN)/python -m benchmarks.accuracy $(ARGS)
-	$(BIN)/python -m benchmarks.accuracy_picture
+	$(BIN)/python docs/accuracy_picture.py
 
 baselines: $(VENV)/.bench  ## the table and the picture of docs/baselines.md
 	$(BIN)/python -m benchmarks.baselines.run --picture docs/images/baselines.png $(ARGS)

@@ -1,7 +1,7 @@
 """Accuracy against finite elements: FreeForm's table, the clamp, cubature, and what goes beyond it.
 
 Run: ``python -m benchmarks.accuracy [suite ...] [--output out/accuracy.json]``; then
-``python -m benchmarks.accuracy_picture`` draws the picture. Suites that are run replace their rows in the output.
+``python docs/accuracy_picture.py`` draws the picture. Suites that are run replace their rows in the output.
 Reference: `tests/oracle`. Protocol and figures: `docs/accuracy.md`.
 """
 

@@ -1,7 +1,7 @@
 """Time the splat camera: throughput over worlds, stages and floor, and its peers on the same splats in the same run.
 
-Run from the repository root: ``python -m benchmarks.camera`` (CPU, one core), with ``--peer newton`` for the ray tracer
-of Newton, or ``python -m benchmarks.camera --device cuda:0 --worlds 1 64 256 1024 4096 --peer gsplat``.
+Run from the repository root: ``python -m benchmarks.camera`` (CPU, one core), or ``python -m benchmarks.camera --device
+cuda:0 --worlds 1 64 256 1024 4096 --peer gsplat``.
 
 Every world has its own deformation by 16 handles and its own camera (`camera_scene`); a frame deforms and draws all of
 them. First, pictures of one of three worlds are compared with the splat formula over every splat in float64; pixels
@@ -24,7 +24,7 @@ import numpy as np
 import warp as wp
 
 from benchmarks.camera_scene import DILATION, SceneCamera, blob, handle_scene, intrinsics, orbit
-from benchmarks.clock import Clock
+from benchmarks.clock import Clock, held
 from benchmarks.step import product_rate
 from softmode.splats.raster.rasterizer_kernels import TILE
 from tests.splats.dense_reference import render_dense
@@ -33,7 +33,6 @@ TOLERANCE = 1e-5
 """Largest error of a colour against the float64 reference."""
 UNDECIDED = 1e-4
 """Relative distance to a threshold below which single precision may decide otherwise."""
-NEWTON_COUNTS = (1_000, 5_000, 10_000, 50_000)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -43,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--sizes", type=int, nargs="+", default=[64, 128], help="image edges [px]")
     parser.add_argument("--worlds", type=int, nargs="+", default=[1, 4, 16])
     parser.add_argument("--splats", type=int, default=5000)
-    parser.add_argument("--peer", choices=("gsplat", "newton", "none"), default="none")
+    parser.add_argument("--peer", choices=("gsplat", "none"), default="none")
     parser.add_argument("--repeats", type=int, default=20)
     parser.add_argument("--no-compile", action="store_true", help="leave torch.compile out")
     options = parser.parse_args(arguments)
@@ -52,12 +51,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     wp.config.log_level = wp.LOG_WARNING
     sound = all([check(size, options.splats, options.device) for size in options.sizes])
     report_throughput(options)
-    if options.peer == "newton":
-        clock = Clock(options.device, options.repeats)
-        from benchmarks.camera_quality import report_quality, report_speed
-
-        report_speed(options.sizes, NEWTON_COUNTS, clock)
-        report_quality(options.sizes, options.splats, clock)
     return 0 if sound else 1
 
 
@@ -104,7 +97,7 @@ def report_throughput(options: argparse.Namespace) -> None:
     for size in options.sizes:
         for worlds in options.worlds:
             scene = handle_scene(blob(options.splats), worlds)
-            before = pool_memory(clock.device)
+            before = held(clock.device)
             camera = SceneCamera(scene, size, device=options.device)
             total = clock.replay(camera.frame)
             spent = [clock.replay(run) for run in stages(camera)]
@@ -113,7 +106,7 @@ def report_throughput(options: argparse.Namespace) -> None:
                 f"{size:4d} {worlds:6d} | {total:9.3f} {1e3 * worlds / total:9.0f} |"
                 + "".join(f"{stage:7.2f}" for stage in spent)
                 + f" | {floors[0]:8.3f} {floors[1]:8.3f} {total / max(floors):8.1f} | "
-                f"{(pool_memory(clock.device) - before) / 1e6:.0f} (pool's peak {pool_peak(clock.device) / 1e6:.0f})",
+                f"{(held(clock.device) - before) / 1e6:.0f} (pool's peak {pool_peak(clock.device) / 1e6:.0f})",
                 flush=True,
             )
             picture = camera.rasterizer.rgb.numpy()[0]
@@ -154,11 +147,6 @@ def copy_rate(device: str) -> float:
     size = 2**28 if wp.get_device(device).is_cuda else 2**26
     source, target = (wp.zeros(size, dtype=wp.uint8, device=device) for _ in range(2))
     return 2.0 * size / (1e-3 * Clock(device, 10).median(lambda: wp.copy(target, source)))
-
-
-def pool_memory(device: wp.Device) -> int:
-    """Return the bytes in use in a CUDA device's pool; 0 on CPU."""
-    return int(wp.get_mempool_used_mem_current(device)) if device.is_cuda else 0
 
 
 def pool_peak(device: wp.Device) -> int:

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from softmode.deformables.model.compile_ahead import compile_launches
+
 
 class Clock:
     """Times work on one device.
@@ -50,3 +52,34 @@ def held(device: wp.Device) -> float:
     gc.collect()
     arrays = [found for found in gc.get_objects() if type(found) is wp.array and found.device == device]
     return float(sum({array.ptr: array.capacity for array in arrays if array.ptr and array.deleter}.values()))
+
+
+def replayed(control_step: Callable[[], None], device: wp.Device) -> Callable[[int], None]:
+    """Capture a control step; return what replays it a number of times and waits for the end."""
+    compile_launches(control_step, device)
+    control_step()
+    with wp.ScopedCapture(device=device) as capture:
+        control_step()
+    graph: Any = capture.graph
+
+    def play(count: int) -> None:
+        for _ in range(count):
+            wp.capture_launch(graph)
+        wp.synchronize_device(device)
+
+    play(0)
+    return play
+
+
+def in_spells(
+    play: Callable[[int], None], steps: int, device: wp.Device, look: Callable[[], None]
+) -> tuple[float, int]:
+    """Play steps in ten spells, and look at the state outside of the clock; return the seconds and the steps."""
+    now = time.perf_counter if device.is_cuda else time.process_time
+    each, spent = max(steps // 10, 1), 0.0
+    for _ in range(10):
+        start = now()
+        play(each)
+        spent += now() - start
+        look()
+    return spent, 10 * each

@@ -7,13 +7,13 @@ kg/m^3) falls for 60 steps of 1/60 s; the loss is the sum of its last coordinate
 from __future__ import annotations
 
 import argparse
-import time
 from typing import Any
 
 import newton
 import numpy as np
 import warp as wp
 
+from benchmarks.clock import Clock
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.gradients.adjoint import AdjointOptions, AdjointReduced
 from softmode.deformables.materials.material import Material
@@ -61,17 +61,6 @@ class Bar:
         return self.adjoint.backward(loss_q=self.loss).numpy()
 
 
-def median_ms(work: Any, repeats: int = 5) -> float:
-    """Return the median time of a call per step [ms]."""
-    work()
-    clock = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        work()
-        clock.append(1e3 * (time.perf_counter() - start) / STEPS)
-    return float(np.median(clock))
-
-
 def main() -> None:
     """Print both tables."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -90,7 +79,8 @@ def main() -> None:
     for modes, body in bodies.items():
         for world_count in options.worlds:
             bar = Bar(body, world_count, 1.0e-7, options.device)
-            forward, backward = median_ms(bar.forward), median_ms(bar.backward)
+            clock = Clock(options.device, 5)
+            forward, backward = (clock.median(run) / STEPS for run in (bar.forward, bar.backward))
             print(
                 f"{modes} modes, {body.function_count} functions, {world_count} worlds: forward {forward:.2f} ms/step, "
                 f"backward {backward:.2f} ms/step, ratio {backward / forward:.2f}"

@@ -3,7 +3,9 @@
 Run from the repository root: ``python -m benchmarks.morph [--device cuda:0] [--frames 420] [--worlds 1 64] [--spacing
 0.5] [--damping 4 0.5] [--pairs sphere bunny duck cow car]``. Bodies of the volume of a ball of radius 6.93 m on the
 paper's grid, with its material and step (Xu, Song, Levin, Hyde 2025); times are processor time on a CPU, wall clock on
-a GPU. ``--bodies FILE`` keeps the particles of the pairs, for machines without the assets.
+a GPU. ``--bodies FILE`` keeps the particles of the pairs, for machines without the assets. ``--meshes FOLDER`` morphs
+twelve of the paper's pairs between its own meshes (paper_bob.obj, paper_bunny.obj, paper_isosphere.obj, paper_spot.obj;
+github.com/Chayoso/Shape-morphing-binder, folder assets).
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import trimesh
 import warp as wp
 from scipy.spatial import KDTree
 
@@ -28,10 +31,28 @@ from softmode.mpm import (
     MorphRun,
     MpmSimulation,
     ParticleBody,
+    particles_from_mesh,
 )
 from softmode.objects.solids import filled, solid_of
 
 PAIRS = ("sphere", "bunny", "duck", "cow", "car")
+MESHES = {"sphere": ("isosphere", 11166), "bunny": ("bunny", 9262), "bob": ("bob", 10609), "spot": ("spot", 7651)}
+"""Files of the paper's meshes, and how many particles it fills them with."""
+PAPER = {
+    ("sphere", "bunny"): (420, 75.0, 5302.69, 98.28),
+    ("sphere", "bob"): (600, 60.0, 11600.0, 97.41),
+    ("sphere", "spot"): (400, 60.0, 7685.97, 98.38),
+    ("bob", "sphere"): (450, 70.0, 12018.7, 96.77),
+    ("bob", "bunny"): (600, 75.0, 12055.2, 98.62),
+    ("bob", "spot"): (500, 75.0, 12218.3, 98.31),
+    ("bunny", "sphere"): (500, 100.0, 6104.12, 98.04),
+    ("bunny", "bob"): (630, 120.0, 14184.2, 95.71),
+    ("bunny", "spot"): (400, 110.0, 4469.88, 98.42),
+    ("spot", "sphere"): (400, 75.0, 8606.47, 94.59),
+    ("spot", "bunny"): (400, 75.0, 3694.31, 96.85),
+    ("spot", "bob"): (600, 75.0, 12218.3, 95.29),
+}
+"""Frames and density [kg/m^3] of its table II, first loss and accuracy [%] of its table III."""
 REST = 60
 """Frames without control after a morph, in which the shape should stay."""
 
@@ -45,21 +66,23 @@ def main() -> None:
     parser.add_argument("--spacing", type=float, default=0.5, help="distance between particles [m]")
     parser.add_argument("--target", default="bunny", help="what the ball becomes")
     parser.add_argument("--damping", type=float, nargs="+", default=[4.0], help="zeta [1/s]")
-    parser.add_argument(
-        "--coarse", type=float, default=MorphOptions().coarse, help="0 compares masses on one grid alone"
-    )
+    parser.add_argument("--places", type=float, default=MorphOptions().places, help="0 compares masses alone")
     parser.add_argument("--loss", choices=("log", "squared"), default="log", help="distance of masses on the grid")
     parser.add_argument("--accuracy", type=float, help="leave off when so much of the loss is gone, such as 0.95")
     parser.add_argument("--pairs", nargs="*", help=f"all ordered pairs of these; {' '.join(PAIRS)} if none is named")
     parser.add_argument("--sources", nargs="+", help="only pairs that begin with these")
     parser.add_argument("--bodies", type=Path, help="particles of the pairs (.npz): read if it is there, else written")
     parser.add_argument("--json", type=Path, help="where to write the table")
+    parser.add_argument("--meshes", type=Path, help="folder of the paper's meshes")
     add_record_option(parser)
     options = parser.parse_args()
     wp.config.log_level = wp.LOG_WARNING
     chosen = MorphOptions(
-        frame_count=options.frames, coarse=options.coarse, loss=options.loss, target_accuracy=options.accuracy
+        frame_count=options.frames, places=options.places, loss=options.loss, target_accuracy=options.accuracy
     )
+    if options.meshes is not None:
+        morph_paper(options.meshes, options.spacing, chosen, options.device)
+        return
     if options.pairs is not None:
         bodies = pair_bodies(options.pairs or PAIRS, options.spacing, options.bodies)
         rows = []
@@ -87,6 +110,40 @@ def main() -> None:
                 measured["core" if options.device == "cpu" else "h100"] = seconds
     if options.record:
         record("morph", measured, options.device)
+
+
+def paper_bodies(folder: Path, spacing: float) -> dict[str, ParticleBody]:
+    """Return the paper's meshes filled as it fills them, by name."""
+    meshes = {name: trimesh.load_mesh(folder / f"paper_{file}.obj") for name, (file, _) in MESHES.items()}
+    return {
+        name: particles_from_mesh(m.vertices, m.faces, spacing=spacing, material=MORPH_MATERIAL, exact=False)
+        for name, m in meshes.items()
+    }
+
+
+def paper_pair(bodies: dict[str, ParticleBody], pair: tuple[str, str]) -> list[ParticleBody]:
+    """Return both bodies of a pair with the paper's density."""
+    density = PAPER[pair][1]
+    material = replace(MORPH_MATERIAL, density=density)
+    factor = density / MORPH_MATERIAL.density
+    return [replace(bodies[name], masses=factor * bodies[name].masses, material=material) for name in pair]
+
+
+def morph_paper(folder: Path, spacing: float, options: MorphOptions, device: str) -> None:
+    """Print what becomes of the paper's pairs, beside what it prints."""
+    bodies = paper_bodies(folder, spacing)
+    print("particles: " + ", ".join(f"{name} {b.count} (paper {MESHES[name][1]})" for name, b in bodies.items()))
+    for pair, (frames, _, first, accuracy) in PAPER.items():
+        source, goal = paper_pair(bodies, pair)
+        start = time.process_time() if device == "cpu" else time.perf_counter()
+        run = MorphPlanner(source, goal, replace(options, frame_count=frames), device=device).run()[0]
+        seconds = (time.process_time() if device == "cpu" else time.perf_counter()) - start
+        print(
+            f"{' to '.join(pair)}: first loss {run.losses[0]:.2f} (paper {first}, ratio {run.losses[0] / first:.4f}), "
+            f"{100.0 * run.accuracy:.2f} % (paper {accuracy}), {100.0 * ejected(run, goal):.2f} % over a cell away, "
+            f"{seconds:.1f} s",
+            flush=True,
+        )
 
 
 def centred(bodies: list[ParticleBody]) -> list[ParticleBody]:

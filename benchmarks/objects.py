@@ -18,6 +18,7 @@ import newton
 import numpy as np
 import warp as wp
 
+from benchmarks.clock import Clock
 from softmode.deformables.model.authoring import add_reduced_body
 from softmode.deformables.reduction.options import BuildOptions
 from softmode.deformables.reduction.reduced_stiffness import reduced_stiffness
@@ -51,21 +52,16 @@ def step_time(name: str) -> str:
     world.add_ground_plane()
     model: Any = world.finalize(device="cpu")
     solver, first, second = SolverReduced(model, [thing.body]), model.state(), model.state()
-    for _ in range(60):
+
+    def two_steps() -> None:
         solver.step(first, second, None, None, DT)
         solver.step(second, first, None, None, DT)
-    with wp.ScopedCapture(device="cpu") as capture:
-        solver.step(first, second, None, None, DT)
-        solver.step(second, first, None, None, DT)
-    graph: Any = capture.graph
-    times = []
+
     for _ in range(60):
-        clock = time.perf_counter()
-        wp.capture_launch(graph)
-        times.append(0.5e3 * (time.perf_counter() - clock))
-    body = thing.body
+        two_steps()
+    step, body = 0.5 * Clock("cpu", 60).replay(two_steps), thing.body
     sizes = f"{body.function_count} | {body.point_count} | {body.surface_count} | {thing.visible_splats.count}"
-    return f"| {name} | {sizes} | {seconds:.2f} | {min(times):.2f} |"
+    return f"| {name} | {sizes} | {seconds:.2f} | {step:.2f} |"
 
 
 def compliance(config: ObjectConfig, ratio: float, build: BuildOptions) -> float:

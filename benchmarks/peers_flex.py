@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from benchmarks.peers_flex_kernels import act, count_step
-from softmode.deformables.model.compile_ahead import compile_launches
+from benchmarks.clock import in_spells, replayed
+from benchmarks.peers_kernels import act_hand, count_step
 
 CELLS = (10, 1, 1)
 SIZE = (0.30, 0.04, 0.04)
@@ -63,35 +63,22 @@ def report(worlds: int, device: wp.Device, options: argparse.Namespace) -> None:
     home: Any = wp.zeros(3, dtype=float)
 
     def control_step() -> None:
-        wp.launch(act, worlds, [step, home], [d.ctrl])
+        wp.launch(act_hand, worlds, [step, home], [d.ctrl])
         wp.launch(count_step, 1, [step])
         for _ in range(SUBSTEPS):
             mujoco_warp.step(m, d)
 
-    compile_launches(control_step, device)
-    control_step()
-    with wp.ScopedCapture(device=device) as capture:
-        control_step()
-    graph: Any = capture.graph
-
-    def play(count: int) -> None:
-        for _ in range(count):
-            wp.capture_launch(graph)
-        wp.synchronize_device(device)
-
-    now = time.perf_counter if device.is_cuda else time.process_time
-    wp.synchronize_device(device)
+    play = replayed(control_step, device)
     made = time.perf_counter() - clock
     play(options.warmup)
-    contacts, rows, held, spent = [], [], [], 0.0
-    for _ in range(10):  # the state is looked at outside of the clock
-        start = now()
-        play(options.steps // 10)
-        spent += now() - start
+    contacts, rows, held = [], [], []
+
+    def look() -> None:
         contacts.append(int(d.nacon.numpy()[0]) / worlds)
         rows.append(int(d.nefc.numpy().max()))
         held.append(float((np.abs(d.actuator_force.numpy()[:, 3:]) > 0.02).all(1).mean()))
-    steps = options.steps // 10 * 10
+
+    spent, steps = in_spells(play, options.steps, device, look)
     place = d.flexvert_xpos.numpy().reshape(worlds, -1, 3).mean(axis=1)
     finite = np.isfinite(place).all(axis=1)
     full = max(contacts) * worlds >= worlds * CONTACT_MAX or max(rows) >= ROW_MAX

@@ -24,8 +24,8 @@ import warp as wp
 from newton.solvers import SolverMuJoCo, SolverVBD
 
 from benchmarks.baselines.vbd import kuhn_mesh
-from benchmarks.peers_vbd_kernels import act, count_step
-from softmode.deformables.model.compile_ahead import compile_launches
+from benchmarks.clock import in_spells, replayed
+from benchmarks.peers_kernels import act_arm, count_step
 from softmode.envs.tasks.lift_soft.task import LiftSoftConfig
 from softmode.objects.task_objects import BEAM_MATERIAL
 from softmode.scenes.fixture import Fixture, add_fixture
@@ -146,7 +146,7 @@ class Peer:
 
     def control_step(self) -> None:
         """Launch the steps of a control step, an even number."""
-        wp.launch(act, self.worlds, [self._step, self._home, *self._grip], [self._target], device=self.device)
+        wp.launch(act_arm, self.worlds, [self._step, self._home, *self._grip], [self._target], device=self.device)
         wp.launch(count_step, 1, [self._step], device=self.device)
         for _ in range(STEPS * SUBSTEPS):
             self.state.clear_forces()
@@ -185,29 +185,16 @@ def report(worlds: int, device: wp.Device, options: argparse.Namespace) -> None:
     """Make the worlds, hold the beams, time control steps."""
     clock = time.perf_counter()
     peer = Peer(worlds, device)
-    compile_launches(peer.control_step, device)
-    peer.control_step()
-    with wp.ScopedCapture(device=device) as capture:
-        peer.control_step()
-    graph: Any = capture.graph
-
-    def play(count: int) -> None:
-        for _ in range(count):
-            wp.capture_launch(graph)
-        wp.synchronize_device(device)
-
-    now = time.perf_counter if device.is_cuda else time.process_time
-    wp.synchronize_device(device)
+    play = replayed(peer.control_step, device)
     made = time.perf_counter() - clock
     play(options.warmup)
-    contacts, pressed, spent = [], [], 0.0
-    for _ in range(10):  # what touches is looked at outside of the clock
-        start = now()
-        play(max(options.steps // 10, 1))
-        spent += now() - start
+    contacts, pressed = [], []
+
+    def look() -> None:
         contacts.append(int(peer.contacts.soft_contact_count.numpy()[0]) / worlds)
         pressed.append(peer.pressed())
-    steps = 10 * max(options.steps // 10, 1)
+
+    spent, steps = in_spells(play, options.steps, device, look)
     place = peer.state.particle_q.numpy().reshape(worlds, peer.particles, 3)
     finite = np.isfinite(place).all(axis=(1, 2))
     full = " (FULL)" if max(contacts) > SOFT_MAX else ""

@@ -1,17 +1,12 @@
-"""Cost of contact between soft bodies: cubes stacked on the ground, resting, per step and world.
+"""Cost of contact between soft bodies: cubes stacked on the ground, resting, per step and world; see `scaling`."""
 
-Run: ``python -m benchmarks.pile [--bodies 3] [--worlds 1] [--device cpu] [--modes 8] [--replays 50]``
-"""
-
-import argparse
-import time
 from typing import Any
 
 import newton
 import numpy as np
 import warp as wp
 
-from benchmarks.clock import held
+from benchmarks.clock import Clock, held, replayed
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body, register_custom_attributes
 from softmode.deformables.quadrature.quadrature import quadrature_from_box
@@ -58,44 +53,12 @@ def pile(
         solver.step(first, second, None, None, DT)
         solver.step(second, first, None, None, DT)
 
-    two_steps()
-    with wp.ScopedCapture(device=device) as capture:
-        two_steps()
-    graph: Any = capture.graph
-    clock = time.process_time if device == "cpu" else time.perf_counter
+    play, clock = replayed(two_steps, wp.get_device(device)), Clock(device, replays)
+    play(min(SETTLING, 2 * replays))
     times, iterations = [], []
-    settling = min(SETTLING, 2 * replays)
-    for k in range(settling + replays):
-        wp.synchronize_device(device)
-        start = clock()
-        wp.capture_launch(graph)
-        wp.synchronize_device(device)
-        if k >= settling:
-            times.append(0.5e3 * (clock() - start))
-            iterations.append(solver.iteration.numpy().mean())
+    for _ in range(replays):
+        times.append(0.5 * clock.once(lambda: play(1)))
+        iterations.append(solver.iteration.numpy().mean())
     assert not solver.status.numpy().any()
     memory = (held(wp.get_device(device)) - before) / world_count
     return float(np.median(times)), float(np.mean(iterations)), memory
-
-
-def main() -> None:
-    """Print one row per number of bodies."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--bodies", type=int, nargs="+", default=[1, 2, 3])
-    parser.add_argument("--worlds", type=int, nargs="+", default=[1])
-    parser.add_argument("--modes", type=int, default=8)
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--replays", type=int, default=50, help="measured replays of two steps")
-    args = parser.parse_args()
-    print("| bodies | worlds | ms per step | Newton iterations | memory per world |\n|---|---|---|---|---|")
-    for world_count in args.worlds:
-        for body_count in args.bodies:
-            milliseconds, iterations, memory = pile(body_count, world_count, args.modes, args.device, args.replays)
-            print(
-                f"| {body_count} | {world_count} | {milliseconds:.2f} | {iterations:.1f} | {memory / 1e3:,.0f} kB |",
-                flush=True,
-            )
-
-
-if __name__ == "__main__":
-    main()

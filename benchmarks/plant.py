@@ -1,11 +1,10 @@
 """PIE-NeRF's plant of 78 kernels: steps and pictures a second, and what a step and a picture spend their time on.
 
 Run: ``OMP_NUM_THREADS=1 python -m benchmarks.plant [--all] [--ranks] [--edge 256] [--splats 14000]``, on a GPU with
-``--device cuda:0 [--one-team] [--launches]``. The plant of ``examples/swaying_plant.py`` in its wind, two physics steps
+``--device cuda:0``. The plant of ``examples/swaying_plant.py`` in its wind, two physics steps
 of 1/60 s for each picture; ``--all`` takes all functions of its handles, 2,340 unknowns less those that repeat others,
 instead of 240, and ``--rank-tolerance 1e-12`` those too that hardly differ from others. ``--ranks`` prints how many
-there are that add more than some fractions of mass, and nothing else. ``--one-team`` factors the system by one block of
-threads and assembles it without tiles, as smaller systems are. ``--launches`` lists the launches of two steps.
+there are that add more than some fractions of mass, and nothing else.
 
 Processor time of one core; on CUDA the wall clock, and torch's products and Cholesky of the same sizes beside it. The
 floor is the arithmetic of assembly and factorisation, 27 n^2 P and (3 n)^3 / 3 flops for n functions at P points, in
@@ -15,23 +14,18 @@ each iteration, at the rate of a large float32 matrix product in this run.
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from benchmarks.clock import Clock
-from benchmarks.grasp_phases import kernel_name
 from benchmarks.record import add_record_option, record
-from benchmarks.step import product_rate, report_torch
+from benchmarks.step import product_rate, report_torch, stages
 from examples.swaying_plant import BUILD, RATE, STEPS, blow, make_plant, make_scene
 from softmode.deformables import BuildOptions
 from softmode.deformables.reduction.sources import unpack_sources
-from softmode.deformables.solver.evaluate import assemble, evaluate, evaluate_trial, gather_gradient
-from softmode.deformables.solver.minimise import accept_step, check_convergence, start_line_search
 
 DT = 1.0 / (RATE * STEPS)
 
@@ -43,8 +37,6 @@ def main() -> None:
     parser.add_argument("--all", action="store_true", help="all functions of the handles")
     parser.add_argument("--rank-tolerance", type=float, default=1e-7, help="least mass that a function of --all adds")
     parser.add_argument("--ranks", action="store_true", help="how many of these there are")
-    parser.add_argument("--one-team", action="store_true", help="the paths of smaller systems")
-    parser.add_argument("--launches", action="store_true", help="list the launches of two steps")
     parser.add_argument("--edge", type=int, default=256, help="edge of the picture [px]")
     parser.add_argument("--splats", type=int, default=14000, help="splats of the plant")
     parser.add_argument("--frames", type=int, default=60, help="pictures that are timed")
@@ -62,9 +54,6 @@ def main() -> None:
     built = time.process_time() - start
     with wp.ScopedDevice(given.device):
         scene = make_scene(plant, places[0], given.edge)
-        if given.one_team:
-            scene.solver.tables = dataclasses.replace(scene.solver.tables, tiled=False)
-            scene.solver.tables.system.by_panels = False
         report(scene, built, given)
 
 
@@ -94,10 +83,11 @@ def report(scene: Any, built: float, given: argparse.Namespace) -> None:
         record("plant", measured, given.device)
     constraints = int(scene.solver.tables.constraints.count.numpy().max())
     print(f"status {int(scene.solver.status.numpy().max())}, {constraints} constraints; each phase and a picture:")
-    for name, run in stages(scene).items():
-        print(f"    {name:<28}{clock.replay(run):9.3f} ms")
-    if given.launches:
-        print_launches(scene)
+    state, (camera,) = scene.state, scene.cameras.values()
+    parts = stages(scene.solver, state, state, scene.control, DT)
+    parts |= {"picture: warp": lambda: scene.splats.update(state), "picture: draw": lambda: camera.render(state)}
+    for name, run in parts.items():
+        print(f"    {name:<32}{clock.replay(run):9.3f} ms")
     if scene.model.device.is_cuda:
         report_torch(body, 1, 25)
 
@@ -111,69 +101,6 @@ def print_ranks() -> None:
     value = np.linalg.eigvalsh(raw.T @ raw)
     ranks = {f"{least:.0e}": int((value > least * value[-1]).sum()) for least in (1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-12)}
     print(f"{raw.shape[1]} functions; above fractions of mass there are {ranks}; the body has {body.function_count}")
-
-
-def stages(scene: Any) -> dict[str, Callable[[], None]]:
-    """Return the phases of a step, those of an iteration with a new Hessian, and the parts of a picture."""
-    solver = scene.solver
-    tables, state, (camera,) = solver.tables, solver.tables.newton, scene.cameras.values()
-
-    def stage(run: Callable[[], object]) -> Callable[[], None]:
-        def prepared() -> None:
-            state.active.fill_(1)
-            state.searching.fill_(1)
-            state.refresh.fill_(1)
-            state.evaluated.zero_()
-            run()
-
-        return prepared
-
-    rigid = tables.rigid.count_max, tables.rigid.table.direction, tables.rigid.count_max
-    return {
-        "four fills, in each row": stage(lambda: None),
-        "predict": stage(lambda: solver.begin(scene.state, scene.control, DT)),
-        "detect": stage(lambda: solver.detect(scene.state, scene.control, DT, prescribed=True)),
-        "evaluate with Hessian": stage(lambda: evaluate(tables, DT, derivatives=True)),
-        "gather gradient": stage(lambda: gather_gradient(tables, DT)),
-        "check convergence": stage(lambda: check_convergence(tables, DT)),
-        "assemble": stage(lambda: assemble(tables, DT)),
-        "factor": stage(lambda: tables.system.factor(state.active)),
-        "solve": stage(lambda: tables.system.solve(state.active, *rigid)),
-        "start line search": stage(lambda: start_line_search(tables, DT)),
-        "evaluate trial": stage(lambda: evaluate_trial(tables, DT)),
-        "accept step": stage(lambda: accept_step(tables, DT)),
-        "finish": stage(lambda: solver.finish(scene.state, DT)),
-        "picture: warp": lambda: scene.splats.update(scene.state),
-        "picture: draw": lambda: camera.render(scene.state),
-    }
-
-
-def print_launches(scene: Any) -> None:
-    """Print every kernel of two steps, its threads, how often it runs and, on CUDA, how long."""
-    sizes: dict[str, tuple[int, int, int]] = {}
-    launch = wp.launch
-
-    def noted(kernel: Any, dim: Any, *rest: Any, **more: Any) -> Any:
-        threads, times = int(np.prod(dim)), sizes.get(kernel.key, (0, 0, 0))
-        sizes[kernel.key] = max(threads, times[0]), more.get("block_dim", 256), times[2] + 1
-        return launch(kernel, dim, *rest, **more)
-
-    device, spent = scene.model.device, {}
-    wp.launch = noted
-    try:
-        if device.is_cuda:
-            wp.timing_begin(cuda_filter=wp.TIMING_ALL, synchronize=True)
-        scene._steps()
-        if device.is_cuda:
-            for result in wp.timing_end(synchronize=True):
-                name = kernel_name(result)
-                spent[name] = spent.get(name, 0.0) + result.elapsed
-    finally:
-        wp.launch = launch
-    print("    launches of two steps, eager: most threads, threads of a block, times, ms in all")
-    for name in sorted(sizes, key=lambda name: -spent.get(name, 0.0)):
-        threads, block, times = sizes[name]
-        print(f"    {name:<28}{threads:10d} {min(block, threads):5d} {times:6d} {spent.get(name, np.nan):9.3f}")
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 A benchmark with the option ``--record`` renews the values that it measured: value, date, machine, commit and command.
 ``python docs/figures.py`` then renews the page "Figures" and the marked places of README and pages. A new figure is
-written by hand once, with its question and unit.
+written by hand once, with its question and unit; "of" says whether date and commit are those of its run or of its row.
 """
 
 from __future__ import annotations
@@ -46,6 +46,7 @@ def record(benchmark: str, values: dict[str, float | str], device: str = "cpu", 
         "date": datetime.date.today().isoformat(),
         "machine": machine(device),
         "commit": commit(),
+        "of": "run",
         "command": shlex.join(["python", "-m", f"benchmarks.{Path(sys.argv[0]).stem}", *arguments]),
     }
     for name, value in values.items():

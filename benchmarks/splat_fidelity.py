@@ -30,7 +30,8 @@ from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.quadrature.quadrature import quadrature_from_box
 from softmode.deformables.reduction.build_body import build_body
 from softmode.deformables.reduction.options import BuildOptions
-from softmode.deformables.skinning.skin_splats import STRETCH_LIMIT, SkinSplats, average_basis
+from softmode.deformables.skinning.averages import average_basis
+from softmode.deformables.skinning.skin_splats import STRETCH_LIMIT, SkinSplats
 from softmode.objects import ObjectConfig, load
 from softmode.splats import Splats
 from softmode.splats.raster.pinhole import PinholeCamera

@@ -21,6 +21,7 @@ import newton
 import numpy as np
 import warp as wp
 
+from benchmarks.clock import Clock, held, replayed
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.materials.material import Material
 from softmode.deformables.materials.material_kernels import MaterialModel
@@ -28,8 +29,7 @@ from softmode.deformables.model.authoring import add_pins, add_reduced_body, reg
 from softmode.deformables.quadrature.quadrature import quadrature_from_box
 from softmode.deformables.reduction.build_body import build_body
 from softmode.deformables.reduction.options import BuildOptions
-from softmode.deformables.solver.evaluate import assemble, gather_gradient, solve
-from softmode.deformables.solver.evaluate import evaluate as evaluate_step
+from softmode.deformables.solver.evaluate import assemble, evaluate, evaluate_trial, gather_gradient
 from softmode.deformables.solver.minimise import accept_step, check_convergence, start_line_search
 from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
 
@@ -101,7 +101,7 @@ class Beam:
         builder = newton.ModelBuilder()
         register_custom_attributes(builder)
         builder.replicate(world, world_count)
-        before = self._memory()
+        before = held(self.device)
         model = builder.finalize(device=device)
         model.set_gravity((0.0, 0.0, -9.81))
         self.solver = SolverReduced(model, [body], options=SolverReducedOptions(contact_max=1))
@@ -109,16 +109,15 @@ class Beam:
             self.solver.tables = dataclasses.replace(self.solver.tables, tiled=False)
         self.states = model.state(), model.state()
         self.control = model.control()
-        self.memory = self._memory() - before
-        self.graph = self._capture(self._two_steps)
-        for _ in range(20):
-            wp.capture_launch(self.graph)
+        self.memory = held(self.device) - before
+        self.play = replayed(self._two_steps, self.device)
+        self.play(20)
 
     def report(self, repeats: int, rate: float) -> None:
         """Print one row."""
-        times, iterations = [], []
+        times, iterations, clock = [], [], Clock(self.device, repeats)
         for _ in range(repeats):
-            times.append(0.5 * self._time(self.graph))
+            times.append(0.5 * clock.once(lambda: self.play(1)))
             iterations.append(self.solver.iteration.numpy().max())
         n, points = self.body.function_count, self.body.point_count
         flops = 27.0 * n**2 * points + (3 * n) ** 3 / 3.0
@@ -134,63 +133,50 @@ class Beam:
 
     def report_stages(self, repeats: int) -> None:
         """Print the time of every stage, each captured on its own."""
-        solver, (state, other), progress = self.solver, self.states, self.solver.tables.newton
-
-        def stage(run: Callable[[], None], *, renewed: bool = False) -> Callable[[], None]:
-            def prepared() -> None:
-                progress.active.fill_(1)
-                progress.refresh.fill_(int(renewed))
-                run()
-
-            return prepared
-
-        def evaluate(derivatives: bool) -> Callable[[], None]:
-            return lambda: evaluate_step(solver.tables, DT, derivatives=derivatives)
-
-        stages = {
-            "two fills (in every row below)": stage(lambda: None),
-            "begin": stage(lambda: solver.begin(state, self.control, DT)),
-            "detect": stage(lambda: solver.detect(state, self.control, DT, prescribed=True)),
-            "evaluate with Hessian": stage(evaluate(True), renewed=True),
-            "evaluate with gradient": stage(evaluate(True)),
-            "evaluate energy": stage(evaluate(False)),
-            "gather gradient": stage(lambda: gather_gradient(solver.tables, DT)),
-            "check convergence": stage(lambda: check_convergence(solver.tables, DT)),
-            "assemble with stiffness": stage(lambda: assemble(solver.tables, DT), renewed=True),
-            "assemble": stage(lambda: assemble(solver.tables, DT)),
-            "factor": stage(lambda: solver.tables.system.factor(progress.active)),
-            "factor and solve": stage(lambda: solve(solver.tables)),
-            "start line search": stage(lambda: start_line_search(solver.tables, DT)),
-            "accept step": stage(lambda: accept_step(solver.tables, DT)),
-            "finish": stage(lambda: solver.finish(other, DT)),
-        }
-        for name, run in stages.items():
-            graph = self._capture(run)
-            print(f"    {name:<32}{np.median([self._time(graph) for _ in range(repeats)]):8.3f} ms")
+        for name, run in stages(self.solver, *self.states, self.control, DT).items():
+            print(f"    {name:<32}{Clock(self.device, repeats).replay(run):8.3f} ms")
 
     def _two_steps(self) -> None:
         first, second = self.states
         self.solver.step(first, second, self.control, None, DT)
         self.solver.step(second, first, self.control, None, DT)
 
-    def _capture(self, run: Callable[[], None]) -> Any:
-        run()
-        with wp.ScopedCapture(device=self.device) as capture:
+
+def stages(
+    solver: SolverReduced, state: newton.State, other: newton.State, control: newton.Control, dt: float
+) -> dict[str, Callable[[], None]]:
+    """Return the stages of a step from one state to another; all worlds take part in each."""
+    tables, progress = solver.tables, solver.tables.newton
+    rigid = tables.rigid.count_max, tables.rigid.table.direction, tables.rigid.count_max
+
+    def stage(run: Callable[[], object], *, renewed: bool = False) -> Callable[[], None]:
+        def prepared() -> None:
+            progress.active.fill_(1)
+            progress.searching.fill_(1)
+            progress.refresh.fill_(int(renewed))
+            progress.evaluated.zero_()
             run()
-        return capture.graph
 
-    def _time(self, graph: Any) -> float:
-        """Return the time of one replay [ms]."""
-        clock = time.perf_counter if self.device.is_cuda else time.process_time  # of this process: one core
-        wp.synchronize_device(self.device)
-        start = clock()
-        wp.capture_launch(graph)
-        wp.synchronize_device(self.device)
-        return 1e3 * (clock() - start)
+        return prepared
 
-    def _memory(self) -> float:
-        """Return the bytes in use on a CUDA device; nan on CPU."""
-        return float(wp.get_mempool_used_mem_current(self.device)) if self.device.is_cuda else float("nan")
+    return {
+        "four fills (in every row below)": stage(lambda: None),
+        "begin": stage(lambda: solver.begin(state, control, dt)),
+        "detect": stage(lambda: solver.detect(state, control, dt, prescribed=True)),
+        "evaluate with Hessian": stage(lambda: evaluate(tables, dt, derivatives=True), renewed=True),
+        "evaluate with gradient": stage(lambda: evaluate(tables, dt, derivatives=True)),
+        "evaluate energy": stage(lambda: evaluate(tables, dt, derivatives=False)),
+        "gather gradient": stage(lambda: gather_gradient(tables, dt)),
+        "check convergence": stage(lambda: check_convergence(tables, dt)),
+        "assemble with stiffness": stage(lambda: assemble(tables, dt), renewed=True),
+        "assemble": stage(lambda: assemble(tables, dt)),
+        "factor": stage(lambda: tables.system.factor(progress.active)),
+        "solve": stage(lambda: tables.system.solve(progress.active, *rigid)),
+        "start line search": stage(lambda: start_line_search(tables, dt)),
+        "evaluate trial": stage(lambda: evaluate_trial(tables, dt)),
+        "accept step": stage(lambda: accept_step(tables, dt)),
+        "finish": stage(lambda: solver.finish(other, dt)),
+    }
 
 
 def product_rate(device: str) -> float:
@@ -234,14 +220,7 @@ def report_torch(body: ReducedBody, system_count: int, repeats: int) -> None:
             torch.bmm(left, right, out=block)
 
     def timed(run: Callable[[], Any]) -> float:
-        times = []
-        for _ in range(max(repeats // 5, 3)):
-            torch.cuda.synchronize()
-            start = time.perf_counter()
-            run()
-            torch.cuda.synchronize()
-            times.append(1e3 * (time.perf_counter() - start))
-        return float(np.median(times))
+        return Clock("cuda", max(repeats // 5, 3)).median(lambda: (run(), torch.cuda.synchronize()))
 
     print(
         f"    torch: six batched products {timed(assemble):.3f} ms, "

@@ -2,8 +2,9 @@
 
 The toy is the built-in plush with as many splats as asked for, dropped on the ground and recorded at 30 Hz. Times are
 processor time of this process and of the one that opens files, the least of three; baked stages are written once.
+``--imports`` times imports instead, the least of five.
 
-Run: ``python -m benchmarks.usd [--splats 20000] [--frames 60]``
+Run: ``python -m benchmarks.usd [--splats 20000] [--frames 60] [--imports]``
 """
 
 import argparse
@@ -25,14 +26,17 @@ from softmode.deformables.model.authoring import add_reduced_body
 from softmode.deformables.solver.solver_reduced import SolverReduced
 from softmode.objects import Placed, load
 from softmode.splats import Splats, make_plush
+from softmode.splats import write_usd as write_splats
 from softmode.usd import (
     UsdAnimation,
     UsdAnimationOptions,
     UsdExportOptions,
     add_usd,
     read_animation,
+    read_usd_scene,
     write_usd,
 )
+from tests.usd.test_import_newton import SMALL, everything
 
 DT = 1.0 / 240.0
 HALF = UsdExportOptions(weights="half", kaolin=False, splats="half")
@@ -76,13 +80,46 @@ def row(name: str, path: Path, wrote: float, read: float, peak: str = "") -> Non
     print(f"| {name} | {path.stat().st_size / 1e6:.2f} | {wrote:.2f} | {read:.2f} | {peak} |", flush=True)
 
 
+def report_imports() -> None:
+    """Print the table of imports: a robot, a prop and two soft bodies, and a large set of splats."""
+    rng, count = np.random.default_rng(0), 300_000
+    quats, scales, opacities = np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)), np.full((count, 3), 0.01), np.full(count, 0.9)
+    with tempfile.TemporaryDirectory() as folder:
+        stage, splats = everything(Path(folder) / "a.usda"), Path(folder) / "b.usdc"
+        write_splats(
+            splats,
+            Splats(
+                means=rng.normal(size=(count, 3)),
+                quats=quats,
+                scales=scales,
+                opacities=opacities,
+                sh=rng.normal(size=(count, 16, 3)),
+            ),
+        )
+        print("| what | size [MB] | time [s] |\n|---|---|---|")
+        for name, path, work in (
+            ("read_usd_scene, robot, prop, two bodies", stage, lambda: read_usd_scene(stage)),
+            (
+                "add_usd, the same, bodies cached",
+                stage,
+                lambda: add_usd(newton.ModelBuilder(), stage, build_options=SMALL),
+            ),
+            ("read_usd_scene, 300,000 splats of degree 3", splats, lambda: read_usd_scene(splats)),
+        ):
+            print(f"| {name} | {path.stat().st_size / 1e6:.2f} | {seconds(work, 5):.2f} |", flush=True)
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--splats", type=int, default=20000)
     parser.add_argument("--frames", type=int, default=60)
+    parser.add_argument("--imports", action="store_true", help="time imports instead")
     options = parser.parse_args()
     wp.config.log_level = wp.LOG_WARNING
+    if options.imports:
+        report_imports()
+        return
     toy = toy_with(options.splats)
     assert toy.splats is not None
     world = newton.ModelBuilder()

@@ -18,8 +18,8 @@ PREAMBLE = """# Figures
 
 These are the headline figures of speed and of what belongs to it. Each has the date of its measurement, the machine,
 the commit and the command that repeats it. Machines differ, so no test asserts a figure. "One core" is a core of a
-shared two-core AVX-512 machine, unless a processor is named; "H200" is one NVIDIA H200. A commit is the one that was
-measured, or the one that recorded the figure.
+shared two-core AVX-512 machine, unless a processor is named; "H200" is one NVIDIA H200. "By" a date: the row
+was written then, with that commit; when the run was, and of which commit, is not known.
 
 Figures are medians of many repetitions. On a shared machine they are processor time. Ratios are taken within one
 run. Where softmode stands beside something else, both run in the same script, on the same machine, with the same
@@ -63,7 +63,8 @@ def page(known: dict[str, dict[str, Any]]) -> str:
         text += "|---|---|---|---|---|\n"
         for name, figure in known.items():
             if name.startswith(f"{file}."):
-                cells = (figure["what"], written(figure), figure["machine"], f"{figure['date']}, {figure['commit']}")
+                told = f"{'' if figure['of'] == 'run' else 'by '}{figure['date']}, {figure['commit']}"
+                cells = (figure["what"], written(figure), figure["machine"], told)
                 text += f"| {' | '.join(cells)} | `{figure['command']}` |\n"
     return text
 

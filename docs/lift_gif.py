@@ -1,6 +1,7 @@
-"""Make the moving picture of README.md, docs/images/lift.gif, from the film of ``make demo``.
+"""Make a moving picture of README.md, such as docs/images/lift.gif, from a film, such as that of ``make demo``.
 
-Run: ``make demo``, then ``python docs/lift_gif.py [out/lift.mp4] [docs/images/lift.gif]``.
+Run: ``make demo``, then ``python docs/lift_gif.py [out/lift.mp4] [docs/images/lift.gif]``. docs/gallery.md has the
+commands of the other films.
 """
 
 from __future__ import annotations
@@ -58,8 +59,8 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("film", nargs="?", type=Path, default=Path("out/lift.mp4"))
     parser.add_argument("target", nargs="?", type=Path, default=Path("docs/images/lift.gif"))
     parser.add_argument("--width", type=int, default=512, help="width of the GIF [px]")
-    parser.add_argument("--seconds", type=float, default=3.0, help="how much of the film is used [s]")
-    parser.add_argument("--colors", type=int, default=192, help="number of colours")
+    parser.add_argument("--seconds", type=float, default=4.0, help="how much of the film is used [s]")
+    parser.add_argument("--colors", type=int, default=160, help="number of colours")
     options = parser.parse_args(arguments)
     size = write_gif(options.film, options.target, width=options.width, seconds=options.seconds, colors=options.colors)
     print(f"wrote {options.target}, {size / 1e3:.0f} kB")

@@ -14,10 +14,13 @@ import numpy as np
 import warp as wp
 from gymnasium.utils.env_checker import check_env
 
-from softmode.envs import Segment, SoftEnv, SoftVectorEnv, Task, TaskConfig, check_vector_env, rl_scene
+from softmode import envs
+from softmode.envs import Segment, SoftEnv, SoftVectorEnv, StepResult, Task, TaskConfig, WorldState, rl_scene
 from softmode.objects import ObjectConfig
 from softmode.scenes import TableSceneConfig
 from softmode.viz import Film
+
+# pyright: reportGeneralTypeIssues=false
 
 # ----------------------------------------------------------------------------------------------------------------------
 RADIUS, HEIGHT = 0.02, 0.12  # of the post [m]
@@ -32,42 +35,42 @@ class ToppleConfig(TaskConfig):
     fallen: float = 0.5  # height of the centre, relative to a standing post's, below which it has fallen
 
 
+@wp.struct
+class Plan:
+    """What the kernels know beside the state, found by the names of the fields."""
+
+    column_upright: int  # where "upright" is in the observation
+    rest_height: wp.array[float]  # of the centre of a standing post [m]
+    fallen: float
+
+
 @wp.kernel
-def observe(centre: wp.array2d[wp.vec3], height: float, column: int, seen: wp.array2d[float], info: wp.array2d[float]):
+def observe(state: WorldState, plan: Plan, result: StepResult):
     """Write how high the centre is to info and observation; 1 for a standing post."""
     w = wp.tid()
-    info[w, 0] = centre[w, 0][2] / height
-    seen[w, column] = info[w, 0]
+    result.metrics[w, 0] = state.object_position[w, 0][2] / plan.rest_height[w]
+    result.observation[w, plan.column_upright] = result.metrics[w, 0]
 
 
 @wp.kernel
-def judge(gap: wp.array2d[float], info: wp.array2d[float], fallen: float, terms: wp.array2d[float], ok: wp.array[bool]):
+def judge(state: WorldState, plan: Plan, result: StepResult):
     """Reward nearness and the fall; the task is solved while the post lies."""
     w = wp.tid()
-    terms[w, 0] = 1.0 - wp.tanh(5.0 * wp.length(wp.vec3(gap[w, 0], gap[w, 1], gap[w, 2])))
-    terms[w, 1] = 3.0 * wp.clamp(1.0 - info[w, 0], 0.0, 1.0)
-    ok[w] = info[w, 0] < fallen
+    gap = wp.length(state.object_position[w, 0] - wp.transform_get_translation(state.tool_pose[w]))
+    result.terms[w, 0] = 1.0 - wp.tanh(5.0 * gap)
+    result.terms[w, 1] = 3.0 * wp.clamp(1.0 - result.metrics[w, 0], 0.0, 1.0)
+    result.success[w] = result.metrics[w, 0] < plan.fallen
 
 
 class Topple(Task):
     """Knock over a soft post. Reward terms: ``reach`` (0..1), ``fall`` (0..3)."""
 
-    config_class, term_names, metric_names = ToppleConfig, ("reach", "fall"), ("upright",)
-    config: ToppleConfig
+    config_class, step_kernels = ToppleConfig, (observe, judge)
+    term_names, metric_names = ("reach", "fall"), ("upright",)
 
     def object_segments(self) -> tuple[Segment, ...]:
         """Add a number to the observation."""
         return (Segment("upright", 1, -2.0, 3.0),)
-
-    def observe(self) -> None:
-        """Write observation and info, from the state alone."""
-        given = [self.scene.object_position, self.scene.soft.height, self.column("upright")]
-        self.launch(observe, given, [self.observation, self.metrics])
-
-    def evaluate(self) -> None:
-        """Judge the step."""
-        gap: Any = self.observation[:, self.segments["object_offset"][0]]
-        self.launch(judge, [gap, self.metrics, self.config.fallen], [self.terms, self.success])
 
 
 ToppleEnv = type("ToppleEnv", (SoftEnv,), {"task_class": Topple})
@@ -100,7 +103,7 @@ def main(arguments: list[str] | None = None) -> None:
     wp.config.log_level = wp.LOG_WARNING
     env, ends = gym.make("Topple-v0", render_mode="rgb_array"), []
     check_env(env.unwrapped)
-    print(check_vector_env(lambda n: gym.make_vec("Topple-v0", n, max_episode_steps=8), num_envs=2, steps=20))
+    print(envs.check_vector_env(lambda n: gym.make_vec("Topple-v0", n, max_episode_steps=8), num_envs=2, steps=20))
     with Film(Path("out/custom_env.mp4")) as film:
         for seed in range(episodes):
             ended, _ = [False], env.reset(seed=seed)

@@ -12,13 +12,12 @@ from typing import Any
 def lazy_names(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """Return the ``__getattr__`` and ``__dir__`` of a package whose public names live in other modules.
 
-    A package lists its names in ``__all__``, and says where they live in the imports that type checkers read. Those
-    imports are looked up in its source when the first name is asked for::
+    A package says once what it offers and where that lives, in the imports that type checkers read. They are looked up
+    in its source when the first name is asked for, and are its ``__all__``::
 
         if TYPE_CHECKING:
-            from softmode.shop.apples import Apple
+            from softmode.shop.apples import Apple as Apple
 
-        __all__ = ["Apple"]
         __getattr__, __dir__ = lazy_names(__name__)
 
     Args:
@@ -36,14 +35,16 @@ def lazy_names(package: str) -> tuple[Callable[[str], Any], Callable[[], list[st
 
         # Not by the package's loader: pytest's, which loads the packages of its plug-ins, gives no source.
         source = inspect.getsource(sys.modules[package])
-        imports = (node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.ImportFrom))
-        found = {name.name: "." * node.level + (node.module or "") for node in imports for name in node.names}
-        return {name: found[name] for name in sys.modules[package].__all__}
+        blocks = (block.body for block in ast.parse(source).body if isinstance(block, ast.If))
+        imports = (node for block in blocks for node in block if isinstance(node, ast.ImportFrom))
+        return {name.name: "." * node.level + (node.module or "") for node in imports for name in node.names}
 
     def load(name: str) -> Any:
         """Import a public name from its module."""
         module = sys.modules[package]
-        if name not in module.__all__:
+        if name == "__all__":
+            return sorted(homes())
+        if name.startswith("__") or name not in homes():  # reading the source asks for names with underscores
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         value = getattr(import_module(homes()[name], package), name)
         setattr(module, name, value)
@@ -51,7 +52,6 @@ def lazy_names(package: str) -> tuple[Callable[[str], Any], Callable[[], list[st
 
     def names() -> list[str]:
         """Return the names of the package, those included that are not imported yet."""
-        module = sys.modules[package]
-        return sorted({*vars(module), *module.__all__})
+        return sorted({*vars(sys.modules[package]), *homes()})
 
     return load, names

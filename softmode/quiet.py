@@ -16,6 +16,8 @@ from collections.abc import Callable, Iterator
 
 import warp as wp
 
+from softmode.stages import compiled
+
 _LIBRARIES = ("softmode", "newton", "mujoco_warp", "warp")
 
 
@@ -33,6 +35,8 @@ class QuietLogger:
 
     def info(self, message: str) -> None:
         """Pass a line on that is not of softmode's use."""
+        if "(compiled)" in message:
+            compiled()
         if self.listener is not None:
             self.listener(message)
         elif wp.config.log_level <= wp.LOG_DEBUG or not _is_own(message):

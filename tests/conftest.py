@@ -125,17 +125,14 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     return True if config.option.markexpr == "fast" and file.endswith(".py") and file not in _FAST else None
 
 
-PLAYBOT = _TESTS.parents[1] / "shared" / "data" / "splats" / "playbot" / "4_0" / "meta.json"
-"""A trained capture, SOG v2: a robot hovering over a patch of ground, with two loose hands. PLAYBOT by Stephane Agullo,
-CC-BY-4.0."""
-
-
 @pytest.fixture(scope="session")
 def playbot() -> Path:
-    """Return the trained capture, or skip."""
-    if not PLAYBOT.is_file():
-        pytest.skip(f"the trained capture {PLAYBOT} is not there")
-    return PLAYBOT
+    """Return the bundled capture: a robot hovering over a patch of ground, with two loose hands."""
+    from softmode.objects.captures import bundled
+
+    found = bundled("playbot")
+    assert found is not None
+    return found
 
 
 @pytest.fixture(scope="session")

@@ -27,7 +27,6 @@ from tests.bodies import cube
 
 ROOT = Path(__file__).resolve().parents[1]
 os.environ.setdefault("SOFTMODE_CACHE", str(ROOT / ".cache" / "softmode"))
-PLAYBOT = ROOT.parent / "shared" / "data" / "splats" / "playbot" / "4_0" / "meta.json"
 PLAY = ["play", "softmode/LiftSoft-v0"]
 
 
@@ -94,11 +93,10 @@ def test_play_films_a_room_as_a_gif(
 
 @pytest.mark.rest
 def test_play_lifts_a_trained_capture(capsys: pytest.CaptureFixture[str]) -> None:
-    """The scripted policy lifts the robot out of a trained SOG capture."""
-    if not PLAYBOT.is_file():
-        pytest.skip(f"the trained capture {PLAYBOT} is not there")
-    assert main([*PLAY, "--splat", str(PLAYBOT), "--size", "0.08"]) == 0
-    assert "success: True" in capsys.readouterr().out
+    """The scripted policy lifts the robot out of the bundled capture, and the author is named."""
+    assert main([*PLAY, "--splat", "playbot"]) == 0
+    said = capsys.readouterr()
+    assert "success: True" in said.out and "by Stephane Agullo" in said.err
 
 
 @pytest.mark.rest
@@ -158,8 +156,8 @@ def rest(env):
 class SlowLift(LiftSoft):
     scripted_policy = rest
 
-class SlowLiftEnv(SoftEnv):
-    task_class = SlowLift
+class SlowLiftEnv(SoftEnv[SlowLift]):
+    pass
 
 gym.register("SlowLift-v0", entry_point=SlowLiftEnv, max_episode_steps=3)
 """
@@ -344,3 +342,24 @@ def test_a_process_exits_with_the_code(module: str, tmp_path: Path) -> None:
     assert run.returncode == 2 and run.stdout == ""
     assert run.stderr.count("\n") == 1 and run.stderr.startswith("softmode: error: unknown policy")
     assert listing(tmp_path) == []
+
+
+def test_hints_name_the_commands_own_help(capsys: pytest.CaptureFixture[str]) -> None:
+    """An option that is not there, and a file that is not named or named twice, say where help is."""
+    for words, told in (
+        (["play", "softmode/LiftSoft-v0", "--nonsense"], "softmode play --help"),
+        (["splat", "convert", "a.ply", "--nonsense"], "softmode splat convert --help"),
+    ):
+        with pytest.raises(SystemExit):
+            main(words)
+        assert told in " ".join(capsys.readouterr().err.split())
+    assert main(["splat", "convert", "a.ply"]) == 2
+    assert main(["objects", "export", "mug", "a.ply", "-o", "b.ply"]) == 2
+    assert capsys.readouterr().err.count("-o out/toy.npz") == 2
+
+
+def test_a_film_into_a_folder_that_is_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It is refused before anything is built."""
+    (tmp_path / "out").write_text("")
+    assert main([*PLAY, "-o", str(tmp_path / "out" / "film.mp4")]) == 2
+    assert "film.mp4" in capsys.readouterr().err

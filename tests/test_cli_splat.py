@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from softmode import stages
 from softmode.cli.main import main
 from softmode.envs.markers import dots
 from softmode.splats import Splats, make_plush, read_splats, write_ply, write_splats
@@ -153,19 +154,27 @@ def test_show_draws_what_would_be_taken(
 ) -> None:
     """The sheet appears; the plush is taken, ground and block are not; a crop takes the block."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(stages, "PERIOD", 0.01)
     assert main(["splat", "show", str(capture)]) == 0
     said, err = capfd.readouterr()
     assert listing(tmp_path) == ["toy_sheet.png"] and "Module" not in said + err
-    words = said.split()
-    assert int(words[0]) >= 3 and 2700 <= int(words[2]) <= 3000 and words[4] == "7300"
+    for what in ("finding the object", "filling it", "drawing the sheet"):  # no stage is silent for longer
+        assert what in err
+    first, block, last = (said.splitlines()[k].split() for k in (0, 2, -2))
+    assert first[0] == "1:" and first[-1] == "(taken)" and block[0] == "3:" and 280 <= int(block[1]) <= 300
+    assert 2700 <= int(last[0]) <= 3000 and last[2] == "7300"
     with Image.open(tmp_path / "toy_sheet.png") as sheet:
         picture = np.asarray(sheet.convert("RGB")).astype(int)
     assert picture.shape[1] == 1600
-    red = (picture[..., 0] > 150) & (picture[..., 1] < 120) & (picture[..., 2] < 120)
-    assert red[: len(red) // 2].sum() < 0.25 * red[len(red) // 2 :, :500].sum()  # tinted where the cut is shown
+    green = (picture[..., 1] - picture[..., 0] > 40) & (picture[..., 1] - picture[..., 2] > 20)
+    assert green[: len(green) // 2].sum() < 0.25 * green[len(green) // 2 :, :500].sum()  # the second candidate
     box = ["--crop", "0.1", "0.1", "0.02", "0.14", "0.14", "0.08"]
     assert main(["splat", "show", str(capture), "--out", str(tmp_path / "block.png"), *box]) == 0
     assert "of 300 splats" in capfd.readouterr().out
+    assert main(["splat", "show", str(capture), "--out", str(tmp_path / "two.png"), "--part", "2"]) == 0
+    assert capfd.readouterr().out.splitlines()[1].endswith("(taken)")
+    assert main(["splat", "show", str(capture), "--part", "1", "7"]) == 2
+    assert "part 7: the capture has the candidates 1 to 3" in capfd.readouterr().err
 
 
 def test_show_says_what_cannot_be_built(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

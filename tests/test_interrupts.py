@@ -78,15 +78,15 @@ def test_a_film_that_is_not_finished_goes(tmp_path: Path, capfd: pytest.CaptureF
 @pytest.mark.rest
 def test_a_body_that_is_not_built_is_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """`body build` ends within the build."""
-    from softmode.objects import object_build
+    from softmode.objects import loader
 
-    begun, real = threading.Event(), object_build.build_object
+    begun, real = threading.Event(), loader.build_object
 
     def build(*arguments: object, **given: object) -> object:
         begun.set()
         return real(*arguments, **given)  # pyright: ignore[reportArgumentType]
 
-    monkeypatch.setattr(object_build, "build_object", build)
+    monkeypatch.setattr(loader, "build_object", build)
     with faults.signalled(signal.SIGTERM, begun.is_set):
         code = main(["body", "build", "mug", "--points", "2000", "-o", str(tmp_path / "mug.npz")])
     assert code == 143 and not list(tmp_path.iterdir())

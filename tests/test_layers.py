@@ -12,7 +12,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 FLOORS = (
     "softmode errors",
-    "leftovers interrupts",
+    "leftovers interrupts stages",
     "files checks lanes lazy pause quiet vector_check versions",
     "deformables foreign",
     "splats robots mpm",

@@ -68,10 +68,14 @@ def test_wheel_holds_the_package_and_nothing_else(dist: Path) -> None:
     info = f"softmode-{softmode.__version__}.dist-info"
     assert {name.partition("/")[0] for name in names} == {"softmode", "pytest_softmode.py", info}
     modules = {str(path.relative_to(ROOT)) for path in (ROOT / "softmode").rglob("*.py")}
+    captured = {str(path.relative_to(ROOT)) for path in (ROOT / "softmode/objects/captures/playbot").iterdir()}
     templates = {str(path.relative_to(ROOT)) for path in (ROOT / "softmode/cli/templates").rglob("*.txt")}
-    assert {name for name in names if name.startswith("softmode/")} == modules | templates | {"softmode/py.typed"}
-    assert templates
+    assert {name for name in names if name.startswith("softmode/")} == modules | templates | captured | {
+        "softmode/py.typed"
+    }
+    assert templates and "softmode/objects/captures/playbot/ATTRIBUTION.txt" in captured
     assert f"{info}/licenses/LICENSE" in names
+    assert b"PLAYBOT by Stephane Agullo" in _contents(wheel)[f"{info}/licenses/NOTICE"]
     assert wheel.stat().st_size < 2_000_000
 
 

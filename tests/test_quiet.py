@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import ast
 import os
+import re
 import subprocess
 import sys
+import threading
 from pathlib import Path
 from typing import Any
 
 import pytest
 import warp as wp
 
+from softmode import stages
 from softmode.cli.common import quiet_warp
 from softmode.quiet import quieten_warp
+from softmode.stages import KERNELS
 from tests.test_layers import imports
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -23,6 +28,10 @@ SCRIPT = """
 import gymnasium as gym
 import softmode
 import warp as wp
+from softmode import stages
+
+named, begin = [], stages._WATCH.begin
+stages._WATCH.begin = lambda name: (named.append(name), begin(name))
 
 @wp.kernel
 def mine(x: wp.array[float]):
@@ -37,6 +46,7 @@ wp.launch(mine, 1, outputs=[wp.zeros(1, device="cpu")], device="cpu")
 print("-- all --", flush=True)
 wp.set_logger(None)
 again = gym.make("softmode/LiftSoft-v0")
+print("-- stages --", named, sep="\\n", flush=True)
 """
 
 
@@ -51,7 +61,38 @@ def test_an_environment_prints_nothing(tmp_path: Path) -> None:
     assert before == ""
     assert mine.startswith("Module __main__ ") and mine.count("\n") == 1
     assert "Module softmode.envs.tasks.lift_soft.kernels" in after
-    assert done.stderr.replace(NO_DRIVER, "") == ""
+    said = re.sub(r"softmode: .+, \d+ s\n", "", done.stderr)  # of what takes longer than three seconds
+    assert said.replace(NO_DRIVER, "") == ""
+    named = set(ast.literal_eval(after.rpartition("-- stages --\n")[2]))
+    assert {"making the environment", KERNELS} <= named and any(name.startswith("reading ") for name in named)
+
+
+def test_a_long_stage_is_named_again_and_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The innermost stage is told while nothing else moves; kernels are compiled only where a module was."""
+    told: list[str] = []
+    heard = threading.Event()
+
+    def listen(name: str, seconds: float) -> None:
+        told.append(name)
+        heard.set()
+
+    def wait() -> str:
+        """Return what is told next."""
+        heard.clear()
+        assert heard.wait(20.0)
+        return told[-1]
+
+    monkeypatch.setattr(stages, "PERIOD", 0.02)
+    with stages.told_to(listen), stages.stage("making"):
+        assert wait() == "making"
+        with stages.stage(KERNELS):
+            while wait() != KERNELS:
+                pass
+            stages.compiled()
+            while "compiling kernels" not in wait():
+                pass
+        while wait() != "making":
+            pass
 
 
 def test_every_module_that_launches_is_quiet() -> None:

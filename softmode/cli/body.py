@@ -141,7 +141,8 @@ class BodyShow(_Asset):
         with quiet_warp():
             write_body_picture(out, body, splats, report, **material)
         for key, value in body.provenance.items():
-            print(f"{key:34} {value:.4g}" if isinstance(value, float) else f"{key:34} {value}")
+            if key != "shown":
+                print(f"{key:34} {value:.4g}" if isinstance(value, float) else f"{key:34} {value}")
         print(f"{'eigenvalues [1/m^2]':34} {'  '.join(f'{value:.4g}' for value in body.eigenvalues)}")
         lowest = mode_frequencies(body, **material)[:8]
         print(f"{'frequencies [Hz]':34} {'  '.join(f'{value:.4g}' for value in lowest)}")
@@ -242,8 +243,7 @@ def _examined(options: _Asset) -> tuple[SoftObject, BodyReport]:
     from softmode.deformables.reduction.options import BuildOptions
     from softmode.deformables.reduction.report import report_body
     from softmode.objects.config import ObjectConfig
-    from softmode.objects.loader import load
-    from softmode.objects.object_build import build_object
+    from softmode.objects.loader import build_object, load
     from softmode.objects.object_file import file_kind, stored_material
 
     options.toy.check()

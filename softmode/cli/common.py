@@ -8,9 +8,11 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import fields
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 from softmode.errors import ConfigError
+from softmode.stages import moved
 
 if TYPE_CHECKING:
     from softmode.deformables.reduction.report import Finding
@@ -57,6 +59,7 @@ class _KernelCount:
             from tqdm import tqdm
 
             what, terminal = "compiling kernels (first run only, a minute or two)", sys.stderr.isatty()
+            moved()
             if not terminal:
                 print(what, file=sys.stderr, flush=True)
             self._bar = tqdm(desc=what, unit=" modules", leave=False, disable=not terminal)
@@ -80,6 +83,18 @@ def optional_argument() -> Any:
     import tyro
 
     return tyro.conf.Positional
+
+
+def one_place(argument: Path | None, option: Path | None) -> Path:
+    """Return the file to write, which is given as an argument or as the option -o.
+
+    Raises:
+        ConfigError: If it is given both ways or not at all.
+    """
+    if (argument is None) == (option is None):
+        what = "no file to write is given" if option is None else f"{argument} and {option} are two files to write"
+        raise ConfigError(what, hint="name one, like -o out/toy.npz")
+    return option if argument is None else argument  # type: ignore[return-value]
 
 
 def finding_line(finding: Finding, stream: TextIO) -> str:
@@ -119,9 +134,13 @@ def warn_of_env(env: Any) -> None:
 
 
 def warn_of(thing: SoftObject, arm: ArmDescription | TableRobot | None = None) -> None:
-    """Print, on stderr, what the user should know about an object that an arm, if any, is to take."""
+    """Print, on stderr, what the user should know about an object that an arm, if any, is to take, and whose it is."""
+    from softmode.objects.captures import credit
     from softmode.robots.jaws import ParallelJaw
 
+    file = None if thing.config is None or thing.config.file is None else thing.config.file[1]
+    if by := credit(file):
+        print(f"softmode: {by}", file=sys.stderr)
     for finding in thing.findings(jaw=None if arm is None else ParallelJaw.of(arm)):
         print(f"softmode: {finding_line(finding, sys.stderr)}", file=sys.stderr, flush=True)
 
@@ -146,7 +165,7 @@ def same_fields(options: Any, kind: type) -> dict[str, Any]:
 
 def bar_interval() -> float:
     """Return how often a progress bar is drawn [s]: smoothly on a terminal, seldom in a log."""
-    return 0.1 if sys.stderr.isatty() else 5.0
+    return 0.1 if sys.stderr.isatty() else 2.5
 
 
 class BuildBar:
@@ -177,6 +196,7 @@ class BuildBar:
             self._bar = tqdm(total=100, desc="building the body", unit="%", mininterval=bar_interval())
         self._bar.set_postfix_str(stage, refresh=False)
         self._bar.update(round(100.0 * fraction) - self._bar.n)
+        moved()
         if self._also is not None:
             self._also(stage, fraction)
 

@@ -40,6 +40,53 @@ FIRST_STEPS = """softmode simulates soft objects made of splats or meshes, and r
 softmode list-envs lists the tasks, softmode --help the commands, softmode play --help the options of one."""
 
 
+Commands = dict[str, "type | tuple[str, Commands]"]
+COMMANDS: Commands = {
+    **{"play": Play, "train": Train, "evaluate": Evaluate, "export": Export, "bench": Bench, "record": Record},
+    **{"view": View, "morph": Morph, "new": New, "check": Check, "list-envs": ListEnvs, "robots": Robots},
+    "splat": (
+        "Draw, make, inspect and convert splat files.",
+        {"show": SplatShow, "from-mesh": SplatFromMesh, "info": SplatInfo, "convert": SplatConvert},
+    ),
+    "radiance": ("Inspect fields, bake them to splats.", {"info": RadianceInfo, "bake": RadianceBake}),
+    "body": (
+        "Build, draw, check and cut the bodies of soft objects.",
+        {"build": BodyBuild, "show": BodyShow, "check": BodyCheck, "cut": BodyCut},
+    ),
+    "objects": (
+        "List, draw and write the preset objects.",
+        {"list": ObjectsList, "show": ObjectsShow, "export": ObjectsExport},
+    ),
+}
+"""The commands by name; of one with commands of its own what it is about, and these."""
+
+
+def _chosen(given: list[str]) -> tuple[type | Commands, list[str]]:
+    """Return the command that the first words name, or the commands there are behind them; and these words."""
+    here: type | Commands = COMMANDS
+    words: list[str] = []
+    for word in given:
+        if isinstance(here, type) or word not in here:
+            break
+        found = here[word]
+        here = found if isinstance(found, type) else found[1]
+        words.append(word)
+    return here, words
+
+
+def _one_of(commands: Commands) -> Any:
+    """Return the choice among commands by name."""
+    import tyro
+
+    def choice(name: str, found: type | tuple[str, Commands]) -> Any:
+        subcommand = tyro.conf.subcommand
+        if isinstance(found, type):
+            return Annotated[found, subcommand(name)]
+        return Annotated[_one_of(found[1]), subcommand(name, description=found[0])]
+
+    return functools.reduce(operator.or_, (choice(name, found) for name, found in commands.items()))
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; return the exit code.
 
@@ -65,29 +112,11 @@ def _run(arguments: list[str] | None, stack: contextlib.ExitStack) -> int:
     try:
         with needs_extra("demo", "the command line needs tyro"):
             import tyro
-        subcommand = tyro.conf.subcommand
-
-        def one_of(commands: dict[str, type]) -> Any:
-            """Return the choice among commands by name."""
-            return functools.reduce(
-                operator.or_, (Annotated[kind, subcommand(name)] for name, kind in commands.items())
-            )
-
-        kinds = one_of({"play": Play, "train": Train, "evaluate": Evaluate, "export": Export, "bench": Bench})
-        kinds |= one_of({"record": Record, "view": View, "morph": Morph})
-        kinds |= one_of({"new": New, "check": Check, "list-envs": ListEnvs, "robots": Robots})
-        splat = one_of({"show": SplatShow, "from-mesh": SplatFromMesh, "info": SplatInfo, "convert": SplatConvert})
-        kinds |= Annotated[splat, subcommand("splat", description="Draw, make, inspect and convert splat files.")]
-        radiance = one_of({"info": RadianceInfo, "bake": RadianceBake})
-        kinds |= Annotated[radiance, subcommand("radiance", description="Inspect fields, bake them to splats.")]
-        body = one_of({"build": BodyBuild, "show": BodyShow, "check": BodyCheck, "cut": BodyCut})
-        kinds |= Annotated[
-            body, subcommand("body", description="Build, draw, check and cut the bodies of soft objects.")
-        ]
-        objects = one_of({"list": ObjectsList, "show": ObjectsShow, "export": ObjectsExport})
-        kinds |= Annotated[objects, subcommand("objects", description="List, draw and write the preset objects.")]
         config = (tyro.conf.PositionalRequiredArgs, tyro.conf.DisallowNone)
-        command = tyro.cli(kinds, prog="softmode", args=arguments, config=config)
+        chosen, words = _chosen(given)
+        # A command that is named is parsed alone, so that hints name its own help.
+        kind = chosen if isinstance(chosen, type) else _one_of(chosen)
+        command = tyro.cli(kind, prog=" ".join(["softmode", *words]), args=given[len(words) :], config=config)
         stack.enter_context(plain_output())
         return command.run()
     except SoftmodeError as error:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from softmode.checks import require_number
-from softmode.cli.common import bar_interval, quiet_warp, warp_device
+from softmode.cli.common import bar_interval, quiet_warp, short_name, warp_device
 from softmode.errors import ConfigError
 from softmode.files import check_place
 
@@ -40,7 +40,7 @@ class Morph:
     rerun+http://127.0.0.1:9876/proxy; or spawn, which opens one."""
     usd: Path | None = None
     """OpenUSD stage to write (.usdc, .usd or .usda), with every splat or particle of every frame."""
-    out: Path | None = None
+    out: Annotated[Path | None, short_name("-o")] = None
     """Where to keep the run (.npz); one that was cut off is gone on with. out/SOURCE_TARGET.npz if omitted."""
     frames: int = 420
     """Steps on the way to each target."""

@@ -8,9 +8,10 @@ import keyword
 import re
 import string
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from softmode import __version__
+from softmode.cli.common import short_name
 from softmode.errors import ConfigError
 from softmode.files import storage_errors
 from softmode.leftovers import Claim
@@ -31,7 +32,7 @@ class New:
     """What to write."""
     name: str
     """Name of the task, for example slide_disc."""
-    out: Path = Path()
+    out: Annotated[Path, short_name("-o")] = Path()
     """Folder in which the package's folder is made."""
 
     def run(self) -> int:

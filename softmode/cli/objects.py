@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from softmode.cli.common import BuildBar, quiet_warp, short_name
+from softmode.cli.common import BuildBar, one_place, optional_argument, quiet_warp, short_name
 from softmode.errors import ConfigError
 from softmode.files import check_place
 
@@ -26,6 +26,7 @@ class ObjectsList:
 
     def run(self) -> int:
         """Print a line per preset."""
+        from softmode.objects.captures import CAPTURES
         from softmode.objects.shapes.presets import PRESETS
 
         print(f"{'name':10} {'E [Pa]':>8} {'nu':>5} {'kg/m^3':>7} {'friction':>9}  what")
@@ -35,6 +36,8 @@ class ObjectsList:
                 f"{name:10} {made.youngs_modulus:8.0e} {made.poissons_ratio:5.2f} {made.density:7.0f}"
                 f" {made.friction:9.2f}  {preset.what} ({preset.why})"
             )
+        for name, by in CAPTURES.items():
+            print(f"{name:10} a capture, with the material of the task: {by}")
         return 0
 
 
@@ -76,13 +79,20 @@ class ObjectsExport:
 
     name: str
     """Which preset."""
-    out: Path
+    file: Annotated[Path | None, optional_argument()] = None
     """File to write: splats (.ply, .compressed.ply, .splat, .spz), a mesh (.glb, .obj, .stl without colours), a body
     with splats and material (.npz), or a stage with these (.usdc, .usd, .usda). In metres, z up; in .glb y up."""
+    out: Annotated[Path | None, short_name("-o")] = None
+    """The same file, as an option."""
     size: float | None = None
     """Longest edge [m]; the preset's own if omitted."""
     splats: int | None = None
     """Number of splats; 6000 if omitted."""
+
+    @property
+    def place(self) -> Path:
+        """The file to write."""
+        return one_place(self.file, self.out)
 
     def run(self) -> int:
         """Make, write; return the exit code."""
@@ -90,15 +100,15 @@ class ObjectsExport:
         from softmode.splats.formats import WRITABLE, write_splats
 
         config = ObjectConfig(preset=self.name, size=self.size, splat_count=self.splats)
-        suffix = self.out.suffix.lower()
+        suffix = self.place.suffix.lower()
         kinds = (*(kind for kind in WRITABLE if kind not in STAGES), *MESHES, ".npz", *STAGES)
-        if not self.out.name.lower().endswith(kinds):
-            raise ConfigError(f"cannot write {self.out}", hint=f"name it like toy.ply; there are {', '.join(kinds)}")
-        check_place(self.out, "file")
+        if not self.place.name.lower().endswith(kinds):
+            raise ConfigError(f"cannot write {self.place}", hint=f"name it like toy.ply; there are {', '.join(kinds)}")
+        check_place(self.place, "file")
         if suffix in STAGES:
             from softmode.usd.openusd import check_stage
 
-            check_stage(self.out)
+            check_stage(self.place)
         with quiet_warp():
             if suffix in (".npz", *STAGES):
                 self._write_body(config)
@@ -107,8 +117,8 @@ class ObjectsExport:
             else:
                 from softmode.objects.source import object_source
 
-                write_splats(self.out, object_source(config).splats)
-        print(f"wrote {self.out}")
+                write_splats(self.place, object_source(config).splats)
+        print(f"wrote {self.place}")
         return 0
 
     def _write_body(self, config: ObjectConfig) -> None:
@@ -117,16 +127,16 @@ class ObjectsExport:
 
         with BuildBar() as progress:
             thing = load(config, progress=progress)
-        if self.out.suffix.lower() == ".npz":
+        if self.place.suffix.lower() == ".npz":
             from softmode.objects.object_file import write_object
 
-            write_object(self.out, thing.body, thing.splats, thing.radiance)
+            write_object(self.place, thing.body, thing.splats, thing.radiance)
             return
         from softmode.objects.placed import Placed
         from softmode.usd.writer import write_usd
 
-        self.out.parent.mkdir(parents=True, exist_ok=True)
-        write_usd(self.out, Placed(object=thing, position=(0.0, 0.0, thing.height)))
+        self.place.parent.mkdir(parents=True, exist_ok=True)
+        write_usd(self.place, Placed(object=thing, position=(0.0, 0.0, thing.height)))
 
     def _write_mesh(self, config: ObjectConfig) -> None:
         """Write the surface, which files of glTF hold with y up."""
@@ -137,8 +147,8 @@ class ObjectsExport:
         mesh = preset_surface(self.name)
         if config.size is not None:
             mesh.apply_scale(config.size / float(mesh.extents.max()))
-        suffix = self.out.suffix.lower()
+        suffix = self.place.suffix.lower()
         if suffix == ".glb":
             mesh.vertices = mesh.vertices @ up_rotation("+y")
-        with whole_file(self.out, "mesh") as file:
+        with whole_file(self.place, "mesh") as file:
             mesh.export(file, file_type=suffix[1:])

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from softmode.checks import require_number, require_numbers
-from softmode.cli.common import BuildBar, bar_interval, own_group, quiet_warp, warn_of_env
+from softmode.cli.common import BuildBar, bar_interval, own_group, quiet_warp, short_name, warn_of_env
 from softmode.cli.object_options import ObjectOptions
 from softmode.cli.robot_options import RobotOptions
 from softmode.envs.catalogue import registered_id
@@ -42,7 +42,7 @@ class Play:
     """Episodes to play."""
     seed: int = 0
     """Seed of the first episode; the next ones count up."""
-    video: Path | None = None
+    video: Annotated[Path | None, short_name("-o")] = None
     """Film to write (.mp4 or .gif): a camera that follows beside an overview. A contact sheet (.png) is written beside
     it."""
     width: int = 640

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Annotated
 
-from softmode.cli.common import bar_interval, quiet_warp, warp_device
+from softmode.cli.common import bar_interval, quiet_warp, short_name, warp_device
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -50,7 +51,7 @@ class RadianceBake:
 
     file: Path
     """The field: .npz, also Plenoxels', or .nvdb."""
-    out: Path | None = None
+    out: Annotated[Path | None, short_name("-o")] = None
     """Splat file to write, of the kind its suffix names; FILE_splats.ply beside the field if omitted."""
     count: int = 12_000
     """Number of splats, about."""

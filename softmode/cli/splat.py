@@ -5,12 +5,13 @@ from __future__ import annotations
 import dataclasses
 import warnings
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from softmode.checks import require_number
-from softmode.cli.common import bar_interval, quiet_warp, warp_device
+from softmode.cli.common import bar_interval, one_place, optional_argument, quiet_warp, short_name, warp_device
 from softmode.errors import AssetError, ConfigError
 from softmode.files import check_place
+from softmode.stages import stage
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -22,7 +23,7 @@ class SplatFromMesh:
 
     mesh: Path
     """Mesh file of any kind that trimesh reads (.glb, .obj, .ply, .stl, ...), with its textures."""
-    out: Path | None = None
+    out: Annotated[Path | None, short_name("-o")] = None
     """Splat file to write, of the kind its suffix names; MESH_splats.ply beside the mesh if omitted."""
     count: int = 10_000
     """Number of splats."""
@@ -96,9 +97,10 @@ class SplatInfo:
         """Print count, degree, box, scales and opacities."""
         import numpy as np
 
+        from softmode.objects.captures import bundled
         from softmode.splats.formats import read_splats
 
-        splats = read_splats(self.file)
+        splats = read_splats(bundled(self.file) or self.file)
         low, high = splats.bounds()
         deciles = [0.1, 0.5, 0.9]
 
@@ -127,34 +129,40 @@ class SplatShow:
 
     file: Path
     """The splat file."""
-    out: Path | None = None
+    out: Annotated[Path | None, short_name("-o")] = None
     """Sheet to write (.png); FILE_sheet.png in the working folder if omitted."""
     up: Literal["+x", "-x", "+y", "-y", "+z", "-z"] | None = None
     """Axis of the file that points up; -y if omitted."""
     crop: tuple[float, float, float, float, float, float] | None = None
     """Box x0 y0 z0 x1 y1 z1 of the file, once turned up, outside which splats are dropped."""
-    part: Literal["thickest", "tallest", "largest", "all"] = "thickest"
-    """Which of the separate parts is the object."""
+    part: Literal["thickest", "tallest", "largest", "all"] | tuple[int, ...] = "thickest"
+    """Which of the separate parts is the object: a rule, or numbers of candidates on the sheet, like 1 2."""
 
     def run(self) -> int:
         """Look, draw, write; return the exit code."""
+        from softmode.objects.captures import bundled
         from softmode.objects.config import ObjectConfig
         from softmode.splats.formats import read_splats
 
         out = self.out if self.out is not None else Path(f"{self.file.stem}_sheet.png")
         check_place(out, "sheet", make_folders=False)
         up = self.up or "-y"
-        splats = read_splats(self.file).oriented(up)
+        with stage(f"reading {self.file.name}"):
+            splats = read_splats(bundled(self.file) or self.file).oriented(up)
         if self.crop is not None:
             splats = splats.cropped(self.crop[:3], self.crop[3:])
         with quiet_warp():
-            from softmode.viz.splat_sheet import survey_splats, write_splat_sheet
+            from softmode.viz.splat_sheet import candidate_lines, survey_splats, write_splat_sheet
 
             survey = survey_splats(splats, ObjectConfig(part=self.part))
+            print("\n".join(candidate_lines(survey)), flush=True)
             taken = f"up {up} of the file{'' if self.up else ' (a guess: change it with --up)'}; z is up here"
-            write_splat_sheet(out, survey, title=self.file.name, notes=[taken, f"part {self.part}"])
+            with stage("drawing the sheet"):
+                write_splat_sheet(out, survey, title=self.file.name, notes=[taken])
         kept = int(survey.kept.sum())
-        print(f"{len(survey.parts)} parts; {kept} of {splats.count} splats would be taken")
+        print(
+            f"{kept} of {splats.count} splats would be taken, and {survey.choice.told.get('floor_splats', 0)} close it"
+        )
         if survey.fill is None:
             print(f"it cannot be built: {survey.why}")
         print(f"wrote {out}")
@@ -170,8 +178,10 @@ class SplatConvert:
 
     source: Path
     """File to read."""
-    target: Path
+    target: Annotated[Path | None, optional_argument()] = None
     """File to write: .ply, .compressed.ply, .splat, .spz, .usd, .usda or .usdc."""
+    out: Annotated[Path | None, short_name("-o")] = None
+    """The same file, as an option."""
     convention: Literal["z-up", "spz", "trained"] | None = None
     """Whom the written file is turned for: softmode (z-up); readers that keep to SPZ's specification, and three.js
     (spz: y up); those that take a file as training leaves it (trained: y down). Without it the numbers stay."""
@@ -185,7 +195,8 @@ class SplatConvert:
         from softmode.foreign import tokens
         from softmode.splats.formats import CONVENTIONS, read_splats, write_splats
 
-        check_splat_target(self.target)
+        target = one_place(self.target, self.out)
+        check_splat_target(target)
         if self.convention is None and self.up is not None:
             raise ConfigError("--up says nothing without a convention", hint="give --convention too, like spz")
         with warnings.catch_warnings():
@@ -197,13 +208,13 @@ class SplatConvert:
             )
             raise AssetError(problem, hint=f"add --drop-invalid to leave them out and keep {splats.count}")
         if self.convention is None:
-            write_splats(self.target, splats)
+            write_splats(target, splats)
         else:
             own = "+z" if self.source.suffix.lower() in tokens.SUFFIXES else "-y"
-            write_splats(self.target, splats.oriented(self.up or own), up=CONVENTIONS[self.convention])
+            write_splats(target, splats.oriented(self.up or own), up=CONVENTIONS[self.convention])
         for note in splats.notes:
             print(f"note: {note}")
-        print(f"wrote {splats.count} splats of degree {splats.sh_degree} to {self.target}")
+        print(f"wrote {splats.count} splats of degree {splats.sh_degree} to {target}")
         return 0
 
 

@@ -9,59 +9,44 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from softmode.checks import require_number
-from softmode.cli.common import own_group, quiet_warp, same_fields, warn_of_env
+from softmode.cli.common import (
+    one_place,
+    optional_argument,
+    own_group,
+    quiet_warp,
+    same_fields,
+    short_name,
+    warn_of_env,
+)
 from softmode.cli.object_options import ObjectOptions
 from softmode.cli.robot_options import RobotOptions
 from softmode.envs.catalogue import is_soft
 from softmode.errors import ConfigError
 from softmode.learning.players import require_torch
+from softmode.learning.train_options import RunOptions, TrainOptions
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Train:
+class Train(RunOptions):
     """Train a policy with PPO.
 
     Example: softmode train softmode/LiftSoft-v0 --splat toy.ply
     """
 
-    env: str
-    """Id of the environment, for example softmode/LiftSoft-v0, or module:id of your own."""
     algo: Literal["ppo"] = "ppo"
     """Algorithm."""
-    num_envs: int = 16
-    """Worlds of each rank: 16 on a CPU, 4096 on a GPU."""
     processes: int | None = None
     """Processes that share the worlds on a CPU; one for each core if omitted."""
-    device: str = "cpu"
-    """cpu, cuda:0, or cuda under torchrun."""
-    seed: int = 0
-    """Seed of networks, exploration and worlds."""
     obs_type: Literal["state", "pixels", "pixels_agent_pos"] | None = None
     """What the policy sees; the environment's own choice if omitted."""
     env_options: str = "{}"
     """Further keyword arguments of the environment as JSON."""
     total_steps: float | None = None
     """Environment steps of all worlds together after which training ends; 1e7 if no limit is given."""
-    time_limit: float | None = None
-    """Seconds of training after which it ends."""
+    run_dir: Annotated[Path | None, short_name("-o")] = None
+    """Folder of the run, not there yet; runs/<Env>/<time>[_name] if omitted."""
     set: tuple[str, ...] = ()
     """Hyperparameters other than the preset's, as NAME=VALUE, for example discount=0.97 hidden=[64,64]."""
-    run_dir: Path | None = None
-    """Folder of the run, not there yet; runs/<Env>/<time>[_name] if omitted."""
-    name: str | None = None
-    """Suffix of the folder's name."""
-    resume: bool = False
-    """Go on with the run in --run-dir after it was ended or killed."""
-    init: Path | None = None
-    """Checkpoint of the same environment whose networks training starts from."""
-    teacher: Path | None = None
-    """Checkpoint of a policy on the state of the same environment, whose actions one from pixels is drawn to."""
-    nan_guard: bool = False
-    """Check every observation and reward; dump the last steps of worlds that are not finite, and stop."""
-    eval_episodes: int = 200
-    """Episodes of the evaluation at the end; none with 0."""
-    checkpoint_seconds: float = 30.0
-    """Seconds between two checkpoints."""
     arm: Annotated[RobotOptions, own_group()] = dataclasses.field(default_factory=RobotOptions)
     """Another robot in place of the built-in arm."""
     toy: Annotated[ObjectOptions, own_group()] = dataclasses.field(default_factory=ObjectOptions)
@@ -74,7 +59,6 @@ class Train:
             hint = "leave the options of object and robot out"
             raise ConfigError("--resume goes on with object and robot of the run", hint=hint)
         from softmode.learning.environments import make_vector_env
-        from softmode.learning.train_options import TrainOptions
         from softmode.learning.trainer import train
 
         def make(*arguments: Any) -> Any:
@@ -173,8 +157,10 @@ class Export:
 
     checkpoint: Path
     """Checkpoint of a run, for example best.npz."""
-    out: Path
+    file: Annotated[Path | None, optional_argument()] = None
     """File to write (.npz), not there yet; play, evaluate, --init and --teacher read it."""
+    out: Annotated[Path | None, short_name("-o")] = None
+    """The same file, as an option."""
 
     def run(self) -> int:
         """Write the file; return the exit code."""
@@ -182,11 +168,12 @@ class Export:
         from softmode.learning.checkpoints import policy_only, read_checkpoint, write_checkpoint
         from softmode.learning.policy import load_policy
 
-        if self.out.exists():
-            raise ConfigError(f"{self.out} exists", hint="remove it, or write another file")
+        out = one_place(self.file, self.out)
+        if out.exists():
+            raise ConfigError(f"{out} exists", hint="remove it, or write another file")
         load_policy(self.checkpoint)  # refuses a file whose actor does not fit its header
-        write_checkpoint(policy_only(read_checkpoint(self.checkpoint)), self.out)
-        print(f"{self.out}: {self.out.stat().st_size / 1e3:.0f} kB")
+        write_checkpoint(policy_only(read_checkpoint(self.checkpoint)), out)
+        print(f"{out}: {out.stat().st_size / 1e3:.0f} kB")
         return 0
 
 

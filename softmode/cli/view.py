@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import os
 import sys
-import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -20,6 +18,7 @@ from softmode.errors import AssetError, ConfigError, SoftmodeError
 from softmode.learning.config_values import split_config
 from softmode.learning.players import trained_policy
 from softmode.mpm.run import is_morph
+from softmode.view.page import open_browser
 
 if TYPE_CHECKING:
     from softmode.view.app import ViewOptions
@@ -101,7 +100,7 @@ def _serve(options: View, session: LiveSession, served: ViewOptions) -> bool:
                     file=sys.stderr,
                 )
             if options.open:
-                _open(app.url)
+                open_browser(app.url)
             try:
                 app.run(options.duration)
             except KeyboardInterrupt:
@@ -136,7 +135,7 @@ def _played(options: View, served: ViewOptions) -> int:
     with MorphPage(MorphRun.load(options.target[0]), served) as page:
         print(f"softmode: open {page.url} in a browser; Ctrl-C ends it", flush=True)
         if options.open:
-            _open(page.url)
+            open_browser(page.url)
         with contextlib.suppress(KeyboardInterrupt):
             page.play(options.duration)
     return 0
@@ -158,7 +157,7 @@ def _prepared(options: View, served: ViewOptions) -> tuple[View, LiveSession] | 
     with PreparePage(file, served, up=toy.up, crop=toy.crop, rest=_words(options)) as page:
         print(f"softmode: open {page.url} in a browser; Ctrl-C ends it", flush=True)
         if options.open:
-            _open(page.url)
+            open_browser(page.url)
         try:
             while page.wait(options.duration):
                 page.show_progress("the body", 0.0)
@@ -195,6 +194,7 @@ def _session(options: View, show_progress: Callable[[str, float], None] | None =
 
     from softmode.envs.arguments import Shortcuts, checked_config
     from softmode.envs.catalogue import env_class, registered_id
+    from softmode.objects.captures import CAPTURES
     from softmode.objects.config import ObjectConfig
     from softmode.objects.shapes.presets import PRESETS
     from softmode.robots.table_robot import TableRobot
@@ -206,7 +206,7 @@ def _session(options: View, show_progress: Callable[[str, float], None] | None =
         raise ConfigError(f"{len(options.target)} things to show: {', '.join(options.target)}", hint="name one")
     device, target = warp_device(options.device), next(iter(options.target), None)
     with BuildBar(show_progress) as progress:
-        missing = target is not None and target not in PRESETS and not Path(target).exists()
+        missing = target is not None and target not in (*PRESETS, *CAPTURES) and not Path(target).exists()
         if target is not None and missing and (target.startswith("softmode/") or ":" in target or target in registry):
             registered_id(target)
             _refuse(options, ("scene", "hold"), "an environment")
@@ -252,12 +252,3 @@ def _refuse(options: View, names: tuple[str, ...], what: str) -> None:
     for field in dataclasses.fields(View):
         if field.name in names and getattr(options, field.name) != field.default:
             raise ConfigError(f"--{field.name} says nothing about {what}", hint=f"leave --{field.name} out")
-
-
-def _open(url: str) -> None:
-    """Open a browser without waiting for it, where there is a display."""
-    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        return
-    import webbrowser
-
-    threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()

@@ -10,22 +10,14 @@ from typing import TYPE_CHECKING
 from softmode.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from softmode.demonstrations.episode import Episode
-    from softmode.demonstrations.reader import Dataset, read_dataset
-    from softmode.demonstrations.recording import Recorded, environment_features, observation_columns, record_episodes
-    from softmode.demonstrations.schema import Feature
-    from softmode.demonstrations.writer import DatasetWriter
-
-__all__ = [
-    "Dataset",
-    "DatasetWriter",
-    "Episode",
-    "Feature",
-    "Recorded",
-    "environment_features",
-    "observation_columns",
-    "read_dataset",
-    "record_episodes",
-]
+    from softmode.demonstrations.episode import Episode as Episode
+    from softmode.demonstrations.reader import Dataset as Dataset
+    from softmode.demonstrations.reader import read_dataset as read_dataset
+    from softmode.demonstrations.recording import Recorded as Recorded
+    from softmode.demonstrations.recording import environment_features as environment_features
+    from softmode.demonstrations.recording import observation_columns as observation_columns
+    from softmode.demonstrations.recording import record_episodes as record_episodes
+    from softmode.demonstrations.schema import Feature as Feature
+    from softmode.demonstrations.writer import DatasetWriter as DatasetWriter
 
 __getattr__, __dir__ = lazy_names(__name__)

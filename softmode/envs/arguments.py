@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, ClassVar, Generic, TypeVar, get_args
 
 import gymnasium as gym
 import numpy as np
@@ -16,12 +16,33 @@ from numpy.typing import NDArray
 
 from softmode.checks import require_choice
 from softmode.envs.robots import Robot, with_robot
+from softmode.envs.task import Task
 from softmode.envs.task_config import ObservationType, TaskConfig
 from softmode.errors import ConfigError
 from softmode.objects.config import ObjectConfig
 
 CONTROL_MODES = ("pose_delta", "joint_delta")
 RENDER_MODES = ("rgb_array",)
+LOOK_ON = "human"
+"""Render mode of a single environment that opens a page in the browser."""
+
+TaskT = TypeVar("TaskT", bound=Task)
+
+
+class TaskEnv(Generic[TaskT]):
+    """What environments of one world and of many are both: those of the task in brackets, ``SoftEnv[LiftSoft]``."""
+
+    metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 30}  # noqa: RUF012  (gymnasium's convention)
+    task_class: ClassVar[type[Task]] = Task
+    """The task."""
+    config: Any
+    """Configuration of the task."""
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Take the task from the brackets."""
+        super().__init_subclass__(**options)
+        arguments = (kind for base in cls.__dict__.get("__orig_bases__", ()) for kind in get_args(base))
+        cls.task_class = next((kind for kind in arguments if isinstance(kind, type)), cls.task_class)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,7 +52,7 @@ class Shortcuts:
     obs_type: ObservationType = "state"
     """Kind of observation."""
     render_mode: str | None = None
-    """"rgb_array" or None."""
+    """"rgb_array", "human" or None."""
     control_mode: str | None = None
     """What actions mean; None keeps the configuration's."""
     splat: str | Path | None = None
@@ -50,6 +71,8 @@ def checked_config(
     given: Shortcuts,
     any_robot: bool = True,
     values: Mapping[str, Any] | None = None,
+    *,
+    single: bool = False,
 ) -> TaskConfig:
     """Return the configuration with the constructor's fields and shortcuts applied.
 
@@ -59,12 +82,13 @@ def checked_config(
         given: The shortcuts.
         any_robot: Whether the task plays with robots from files.
         values: Fields of the configuration, which replace those that it has.
+        single: Whether it is for an environment of one world, which people may look on.
 
     Raises:
         ConfigError: If an option or a field is unknown, or the configuration of another task.
     """
     require_choice("obs_type", given.obs_type, get_args(ObservationType))
-    require_choice("render_mode", given.render_mode, (*RENDER_MODES, None))
+    require_choice("render_mode", given.render_mode, (*RENDER_MODES, *([LOOK_ON] if single else []), None))
     require_choice("control_mode", given.control_mode, (*CONTROL_MODES, None))
     if config is not None and not isinstance(config, wanted):
         hint = f"pass {wanted.__name__}(image_size=128), of {wanted.__module__}"

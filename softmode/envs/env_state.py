@@ -176,7 +176,7 @@ def set_worlds_state(
     now = worlds_state(task)
     _check(owner, arrays, *now)
     before = now[1]
-    if _OBJECT in before and not task.scene.resampled:
+    if _OBJECT in before and not task.scene.occupancy.resampled:
         other = np.flatnonzero(mask & (arrays[_OBJECT] != before[_OBJECT])[:, 0])
         if len(other):
             found = [int(of[_OBJECT][other[0], 0]) for of in (arrays, before)]
@@ -192,23 +192,23 @@ def set_worlds_state(
     chosen = {name: (array, count) for name, array, count in parts}
     _write(*chosen["task.parameters"], values["task.parameters"])
     task.scene.world_mask.assign(mask)
-    if task.scene.resampled:
+    if task.scene.occupancy.resampled:
         _write(*chosen[_OBJECT], values[_OBJECT])
-        task.use_objects()
-    task.apply_materials()
+        task.scene.use_objects()
+    task.materials.apply(task.scene.world_mask)
     for name, array, count in parts:
         _write(array, count, values[name])
     task.scene.observe()
     task.write_observation()
-    task.forget_film(mask)
+    task.film.forget(mask)
     for name in ("task.observation", "task.metrics"):
         _write(*chosen[name], values[name])
-    task.draw_pictures()
+    task.pictures.draw()
 
 
 def owner_of(task: Task) -> dict[str, str]:
     """Return what a state is bound to: task, robot and objects."""
-    things = (*task.scene.members, *task.scene.objects[task.scene.slots :])
+    things = (*task.scene.occupancy.choices, *task.scene.occupancy.others)
     bodies = ", ".join(thing.body.fingerprint[:16] for thing in things)
     robot = hashlib.sha256(repr(task.config.scene.arm).encode()).hexdigest()[:16]
     return {"task": type(task).__name__, "robot": robot, "objects": bodies}
@@ -243,8 +243,9 @@ def _parts(task: Task) -> Iterator[tuple[str, Any, Parts]]:
     or where each world begins, and the end, where worlds with different objects have different sizes.
     """
     scene, controller = task.scene, task.scene.controller
-    differ = len(scene.members) > 1
-    functions, particles = _starts(task) if differ and not scene.resampled else (1, 1)
+    held = scene.occupancy
+    differ = len(held.choices) > 1
+    functions, particles = _starts(task) if differ and not held.resampled else (1, 1)
     for owner, name in ((scene.state, "state"), (scene.control, "control")):
         for field_name, array in _fields(owner, name):
             of_body = ".softmode.q" in field_name
@@ -252,8 +253,8 @@ def _parts(task: Task) -> Iterator[tuple[str, Any, Parts]]:
                 ".particle_" in field_name or ".softmode.stick_" in field_name or ".softmode.dent" in field_name
             )
             yield field_name, array, functions if of_body else particles if of_surface else 1
-    if differ or scene.slots > 1:
-        yield _OBJECT, scene.object_index, 1
+    if differ or held.slots > 1:
+        yield _OBJECT, held.by_world, 1
     tables, data = scene.solver.tables, scene.solver.rigid.mjw_data
     for name in ("commanded_q", "previous_q", "target_position", "target_yaw"):
         yield f"controller.{name}", getattr(controller, name), 1
@@ -284,7 +285,7 @@ def _shifted(task: Task, shapes: NDArray[Any], sign: int) -> NDArray[Any]:
 def _starts(task: Task) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return where the functions and the surface samples of each world begin, and their ends, (world_count + 1,)."""
     scene = task.scene
-    bodies = [[thing.body for thing in scene.objects_of(world)] for world in range(task.world_count)]
+    bodies = [[thing.body for thing in scene.occupancy.objects_of(world)] for world in range(task.world_count)]
     functions = [sum(body.function_count for body in world) for world in bodies]
     samples = [sum(body.surface_count for body in world) for world in bodies]
     return np.cumsum([0, *functions]), np.cumsum([0, *samples])

@@ -11,8 +11,6 @@ wp.set_module_options({"enable_backward": False})
 class GoalColumns:
     """First columns of the observation."""
 
-    tool_position: int  # the first one of proprioception
-    arm: int  # where proprioception stands again
     object_position: int
     goal: int  # as the task writes it
     achieved_goal: int
@@ -27,7 +25,6 @@ class GoalRules:
     sparse: int
     goal_tolerance: float  # [m]
     hold_steps: int
-    arm_size: int  # how much proprioception is
 
 
 @wp.func
@@ -60,10 +57,8 @@ def goal_reward(distance: float, rules: GoalRules):
 
 @wp.kernel
 def observe_goals(columns: GoalColumns, rules: GoalRules, result: StepResult):
-    """Write both goals, and proprioception once more."""
+    """Write both goals."""
     w = wp.tid()
-    for k in range(rules.arm_size):
-        result.observation[w, columns.arm + k] = result.observation[w, columns.tool_position + k]
     for k in range(rules.goal_size):
         result.observation[w, columns.achieved_goal + k] = result.observation[w, columns.object_position + k]
         result.observation[w, columns.desired_goal + k] = result.observation[w, columns.goal + k]

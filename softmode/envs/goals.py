@@ -1,4 +1,4 @@
-"""What goal-conditioned learners (hindsight experience replay) ask of environments whose observations hold goals."""
+"""What goal-conditioned learners (hindsight experience replay) ask of environments, and tasks whose goal is a place."""
 
 from __future__ import annotations
 
@@ -10,7 +10,11 @@ from typing import Any, ClassVar
 import numpy as np
 import warp as wp
 
-from softmode.envs.end_reason import EndReason
+from softmode.deformables.model.structs import filled
+from softmode.envs import goal_kernels as kernels
+from softmode.envs.observation import Segment, goal_part
+from softmode.envs.reward_kernels import EndReason
+from softmode.envs.task import Task
 from softmode.errors import ConfigError
 from softmode.vector_check.tensors import Tensor
 
@@ -35,11 +39,11 @@ class _GoalMethod:
 class GoalMethods:
     """Reward and ends of episodes as functions of the goals; only with state observations, which hold them.
 
-    A subclass names `goal_size` and launches the kernel of the reward.
+    A subclass launches the kernel of the reward; its task has `goal_size`, the numbers of a goal.
     """
 
-    goal_size: ClassVar[int]
-    """Numbers of a goal."""
+    task_class: ClassVar[Any]
+    """The task."""
     device: wp.Device
     """Device on which rewards of numpy arrays are computed: that of the task."""
 
@@ -58,7 +62,7 @@ class GoalMethods:
         Raises:
             ConfigError: If the shapes do not fit.
         """
-        size = self.goal_size
+        size = self.task_class.goal_size
         pair: tuple[Any, ...] = (achieved_goal, desired_goal)
         if not all(isinstance(goal, Tensor) for goal in pair):
             pair = tuple(np.asarray(goal, np.float32) for goal in pair)
@@ -116,3 +120,55 @@ def _torch_stream(tensor: Any) -> contextlib.AbstractContextManager[object]:
     import torch
 
     return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(tensor.device)))
+
+
+def goal_rules(config: Any, goal_size: int) -> Any:
+    """Return what the reward depends on beside the goals, of a configuration with the fields of `PositionGoals`."""
+    return filled(kernels.GoalRules, config, goal_size=goal_size, sparse=int(config.reward_mode == "sparse"))
+
+
+class PositionGoals(Task):
+    """A goal-conditioned variant of a task that observes a place as ``goal``; put it before that task.
+
+    A state observation is a dict: ``achieved_goal`` is the object's centre of mass [m], ``desired_goal`` where it is to
+    be, the first `goal_size` of x, y, z, and ``observation`` the object's part and proprioception, nothing of the goal.
+    The full vector has the parts of the other task as well, so that its scripted policy plays this one too.
+
+    The reward is a function of both goals, ``GoalMethods.compute_reward``; its one term is ``goal``. Success: within
+    ``goal_tolerance`` for ``hold_steps`` steps in a row.
+    """
+
+    goal_size: ClassVar[int] = 3
+    """Numbers of a goal."""
+    term_names = ("goal",)
+
+    def object_segments(self) -> tuple[Segment, ...]:
+        """Both goals, and what the task adds."""
+        reached = goal_part(self.scene.controller.joint_count, self.goal_size)
+        return (*reached, Segment("desired_goal", self.goal_size, -2.0, 2.0), *super().object_segments())
+
+    def build(self) -> None:
+        """Find the columns."""
+        super().build()
+        self._goal_columns = self.layout.columns_in(kernels.GoalColumns)
+        self._goal_rules = goal_rules(self.config, self.goal_size)
+
+    def observe(self) -> None:
+        """Write both goals."""
+        super().observe()
+        self.launch(kernels.observe_goals, [self._goal_columns, self._goal_rules], [self.result])
+
+    def evaluate(self) -> None:
+        """Write the reward and whether the goal is met."""
+        self.launch(kernels.evaluate_goals, [self._goal_columns, self._goal_rules], [self.result])
+
+
+class PositionGoalMethods(GoalMethods):
+    """Rewards of places."""
+
+    config: Any
+
+    def launch_reward(self, achieved: wp.array, desired: wp.array, reward: wp.array) -> None:
+        """Compute the rewards of pairs of places."""
+        inputs = [achieved, desired, goal_rules(self.config, self.task_class.goal_size)]
+        wp.launch(kernels.compute_goal_reward, reward.shape[0], inputs=inputs, outputs=[reward], device=reward.device)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import warp as wp
 
+from softmode.deformables.model.declare import launch
 from softmode.deformables.model.structs import filled
 from softmode.envs import handling_kernels as kernels
 from softmode.errors import ConfigError
@@ -22,7 +22,7 @@ class Handling:
 
     The force is that of a link or finger on all soft bodies together, so what a finger presses on the table with is no
     part of it. Forces are looked at after every substep, deformation after every second, of which the last is one: it
-    costs more. Strains and energies are those of the objects of the task (`TableScene.slots`), at cubature points.
+    costs more. Strains and energies are those of the objects of the task (`Occupancy.slots`), at cubature points.
 
     Args:
         scene: The scene.
@@ -36,22 +36,24 @@ class Handling:
             their peaks, and counts of drops and slips.
         safe: Whether the task is solved and no peak is above its limit.
         force_limit: The limit of each world [N].
+        at_goal: Which objects may be let go where they are, a bit each; the task's `evaluate` writes it.
     """
 
     def __init__(self, scene: TableScene, friction: int, strain_limit: float, force_limit: float | None) -> None:
         """Allocate the figures and watch the scene."""
         worlds, device = scene.world_count, scene.device
-        self._scene, self._strain_limit = scene, strain_limit
+        self._scene = scene
         try:
             pads = ParallelJaw.of(scene.config.arm).friction
         except ConfigError:  # a robot without a gripper holds nothing
             pads = 1.0
-        self._limit = (-1.0 if force_limit is None else force_limit, pads, friction)
+        self._limits = (strain_limit, -1.0 if force_limit is None else force_limit, pads, friction)
         self.handled = wp.zeros((worlds, len(HANDLED)), dtype=float, device=device)
         self.safe = wp.zeros(worlds, dtype=wp.bool, device=device)
         self.step_force, self.step_strain, self.force_limit, self.height = (
             wp.zeros(worlds, dtype=float, device=device) for _ in range(4)
         )
+        self.at_goal = wp.zeros(worlds, dtype=int, device=device)
         self.held_slot, self.falling_slot = (wp.full(worlds, -1, dtype=int, device=device) for _ in range(2))
         self.grip = wp.zeros(worlds, dtype=wp.vec3, device=device)
         self._kept = filled(kernels.Handling, self)
@@ -61,37 +63,29 @@ class Handling:
         """Return what an episode goes on from."""
         return {f"handling.{name}": getattr(self, name) for name in kernels.Handling.vars}
 
-    def _launch(self, kernel: wp.Kernel | Callable[..., None], dim: Any, *inputs: Any) -> None:
-        """Launch a kernel."""
-        wp.launch(kernel, dim=dim, inputs=list(inputs), device=self._scene.device)
-
-    def watch(self, substep: int) -> None:
+    def watch(self, substep: int = 0) -> None:
         """Raise the peaks after a substep."""
         scene, tables = self._scene, self._scene.solver.tables
         fingers = (scene.model.body_world_start, tables.body_wrench, scene.finger_body)
-        self._launch(
-            kernels.watch_forces, scene.world_count, int(substep == 0), *fingers, self.step_force, self.step_strain
-        )
-        if substep % 2 == 0:
-            return
-        dim = (scene.world_count, scene.slots, tables.layout.point_max)
-        bodies = (len(scene.objects), tables.instances, tables.basis, tables.arrays.q)
-        self._launch(kernels.watch_deformation, dim, *bodies, self.handled, self.step_strain)
+        given = (int(substep == 0), *fingers, self.step_force, self.step_strain)
+        launch(scene.device, kernels.watch_forces, scene.world_count, *given)
+        if (scene.config.substeps - 1 - substep) % 2 == 0:
+            dim = (scene.world_count, scene.occupancy.slots, tables.layout.point_max)
+            bodies = (len(scene.objects), tables.instances, tables.basis, tables.arrays.q)
+            launch(scene.device, kernels.watch_deformation, dim, *bodies, self.handled, self.step_strain)
 
-    def watch_grip(self, fresh: wp.array, state: Any) -> None:
-        """Take note of a control step, before it is judged.
+    def judge(self, fresh: wp.array, state: Any, result: Any) -> None:
+        """Take note of a control step that the task has judged, and say whether its success is safe.
 
         Args:
             fresh: Worlds whose step was a reset.
             state: `WorldState`.
+            result: `StepResult`.
         """
-        given = (self._scene.solver.tables.instances, self._scene.model.gravity, self._kept)
-        self._launch(kernels.watch_grip, self._scene.world_count, fresh, *self._limit, state, *given)
-
-    def judge(self, result: Any) -> None:
-        """Say whether successes are safe."""
-        self._launch(kernels.judge, self._scene.world_count, self._strain_limit, self._kept, result)
+        scene = self._scene
+        given = (fresh, *self._limits, state, result, scene.solver.tables.instances, scene.model.gravity, self._kept)
+        launch(scene.device, kernels.judge, scene.world_count, *given)
 
     def forget(self, world_mask: wp.array) -> None:
         """Begin the episodes of the masked worlds."""
-        self._launch(kernels.forget_handling, self._scene.world_count, world_mask, self._kept)
+        launch(self._scene.device, kernels.forget_handling, self._scene.world_count, world_mask, self._kept)

@@ -17,7 +17,7 @@ Handled = IntEnum("Handled", "peak_force peak_strain peak_energy_density drops s
 SLIP = wp.constant(0.02)
 """How far a held object moves in the grip for a slip [m]."""
 DROP = wp.constant(0.05)
-"""How far an object falls that no longer is held for a drop [m]."""
+"""How far an object falls that no longer is held for a drop, beside its goal [m]."""
 LEAST_FORCE = wp.constant(15.0)
 """Least force limit where none is given [N]."""
 MARGIN = wp.constant(3.0)
@@ -110,18 +110,20 @@ def watch_deformation(
 
 
 @wp.kernel
-def watch_grip(
+def judge(
     fresh: wp.array[wp.bool],  # worlds whose step was a reset
+    strain_limit: float,
     force_limit: float,  # [N], negative for that of the object's weight
     pad_friction: float,
     friction: int,  # column of the parameters
     state: WorldState,
+    result: StepResult,
     instances: Instances,
     gravity: wp.array[wp.vec3],
     # In, out:
     handling: Handling,
 ):
-    """Raise peaks, count slips and drops, and say what limit holds; once per control step."""
+    """Raise peaks, count slips and drops, and say whether a success is within the limits; once per control step."""
     w = wp.tid()
     if not fresh[w]:
         handled = handling.handled
@@ -155,15 +157,11 @@ def watch_grip(
     else:
         handling.held_slot[w] = -1
         o = handling.falling_slot[w]
-        if o >= 0 and state.object_position[w, wp.max(o, 0)][2] < handling.height[w] - DROP:
-            handling.handled[w, Handled.drops] += 1.0
-            handling.falling_slot[w] = -1
-
-
-@wp.kernel
-def judge(strain_limit: float, handling: Handling, result: StepResult):
-    """Say whether a success came within the limits."""
-    w = wp.tid()
+        if o >= 0:
+            fallen = state.object_position[w, o][2] < handling.height[w] - DROP
+            if fallen and (result.at_goal[w] & (1 << o)) == 0:
+                handling.handled[w, Handled.drops] += 1.0
+                handling.falling_slot[w] = -1
     gently = handling.handled[w, Handled.peak_force] <= handling.force_limit[w]
     handling.safe[w] = result.success[w] and gently and handling.handled[w, Handled.peak_strain] <= strain_limit
 

@@ -25,6 +25,17 @@ def sphere_marker(radius: float, *, color: tuple[float, float, float] = GREEN, o
     return dots(means, 0.22 * radius, color=color, opacity=opacity)
 
 
+def ring_marker(radius: float) -> Splats:
+    """Return a thin level ring.
+
+    Args:
+        radius: Its radius [m].
+    """
+    angle = np.linspace(0.0, 2.0 * np.pi, 181)[:-1]
+    means = radius * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
+    return dots(means, 0.02 * radius, opacity=0.8)
+
+
 def dots(means: np.ndarray, size: float, *, color: tuple[float, float, float] = GREEN, opacity: float = 0.4) -> Splats:
     """Return round splats.
 

@@ -1,17 +1,21 @@
-"""What differs between episodes: named columns that are drawn on the device at every reset."""
+"""What differs between episodes: named columns that are drawn on the device at every reset, and materials of them."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from softmode.deformables.model.structs import StructType, filled
+from softmode.deformables.model.declare import launch
+from softmode.deformables.tools.parameters import set_parameters
+from softmode.envs import task_kernels as kernels
 from softmode.errors import ConfigError
+from softmode.scenes.occupancy import Occupancy
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,63 +51,128 @@ class Parameter:
 
 
 class ParameterTable:
-    """The parameters of all worlds on the device.
+    """The parameters of all worlds on the device, and what their draws depend on.
 
     Args:
         parameters: What is drawn; a later parameter replaces an earlier one of the same name.
-        world_count: Number of worlds.
-        device: Warp device.
-        kinds: Of every kind of worlds the numbers that are not drawn there, by the name of a parameter.
-        kind: Which kind each world is, shape (world_count,).
+        occupancy: What the worlds hold.
+        kept: For each of its choices the numbers that are not drawn, by the name of a parameter.
 
     Attributes:
         values: The drawn numbers, float32, shape (world_count, columns).
-        low: Least of each column, shape (kinds, columns).
+        low: Least of each column, shape (choices, columns).
         high: Largest of each column, likewise.
+        seed: Seed of each world, int32, shape (world_count,).
+        episode: Episodes since it was given, likewise.
+        options: What a reset option may set, by name: the parameters, and the object where a reset may change it.
     """
 
     def __init__(
-        self,
-        parameters: Sequence[Parameter],
-        world_count: int,
-        device: wp.DeviceLike = None,
-        *,
-        kinds: Sequence[Mapping[str, float]] = ({},),
-        kind: ArrayLike | None = None,
+        self, parameters: Sequence[Parameter], occupancy: Occupancy, kept: Sequence[Mapping[str, float]] = ({},)
     ) -> None:
         """Lay out the columns and upload their ranges."""
         self.parameters = {parameter.name: parameter for parameter in parameters}
-        self.world_count = world_count
+        self.occupancy, self.world_count, device = occupancy, occupancy.world_count, occupancy.device
         ends = np.cumsum([parameter.size for parameter in self.parameters.values()]).tolist()
         self._column = dict(zip(self.parameters, [0, *ends], strict=False))
-
-        chosen = self.parameters.values()
+        given = self.parameters.values()
 
         def upload(bound: str) -> wp.array:
             rows = [
-                [np.array((kept[p.name],) if p.name in kept else getattr(p, bound), np.float32) for p in chosen]
-                for kept in kinds
+                [np.array((own[p.name],) if p.name in own else getattr(p, bound), np.float32) for p in given]
+                for own in kept
             ]
             return wp.array(np.stack([np.concatenate(row) for row in rows]), dtype=float, device=device)
 
         self.low, self.high = upload("low"), upload("high")
-        logs = np.concatenate([np.full(p.size, p.log) for p in chosen])
-        self.log = wp.array(logs, dtype=wp.bool, device=device)
-        rows = np.zeros(world_count, np.int32) if kind is None else np.asarray(kind, np.int32)
-        self.kind = wp.array(rows, dtype=int, device=device)
-        self.values = wp.zeros((world_count, ends[-1]), dtype=float, device=device)
+        logs = np.concatenate([np.full(p.size, p.log) for p in given])
+        self._log = wp.array(logs, dtype=wp.bool, device=device)
+        self.values = wp.zeros((self.world_count, ends[-1]), dtype=float, device=device)
+        self.seed, self.episode = (wp.zeros(self.world_count, dtype=int, device=device) for _ in range(2))
+        self.options = dict(self.parameters)
+        if occupancy.resampled:
+            last, more = len(occupancy.choices) - 1.0, occupancy.slots - 1
+            self.options["object"] = Parameter(name="object", low=(0.0, *[-1.0] * more), high=(last,) * (1 + more))
 
     def column(self, name: str) -> int:
         """Return the first column of a parameter."""
         return self._column[name]
 
-    def columns_in(self, struct: StructType) -> Any:
-        """Return a struct of a kernel whose fields are the first columns of the parameters of their names."""
-        return filled(struct, **self._column)
-
     def columns(self, name: str) -> slice:
         """Return the columns of a parameter."""
         return slice(self._column[name], self._column[name] + self.parameters[name].size)
+
+    def use_seeds(self, seeds: ArrayLike, mask: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """Give the masked worlds seeds, whose episodes count from zero; return the seeds of all."""
+        chosen: NDArray[Any] = self.seed.numpy().copy()
+        count: NDArray[Any] = self.episode.numpy().copy()
+        chosen[mask] = np.asarray(seeds, np.int64)[mask] & 0x7FFFFFFF
+        count[mask] = -1
+        self.seed.assign(chosen)
+        self.episode.assign(count)
+        return chosen
+
+    def draw(self, world_mask: wp.array) -> None:
+        """Draw objects and parameters of the masked worlds; capturable."""
+        self.occupancy.draw(world_mask, self.seed, self.episode)
+        inputs = (world_mask, self.seed, self.occupancy.row, self.low, self.high, self._log)
+        launch(self.occupancy.device, kernels.draw_parameters, self.world_count, *inputs, self.episode, self.values)
+
+    def draw_with(self, world_mask: wp.array, options: Mapping[str, NDArray[np.float32]]) -> None:
+        """Draw what options do not give.
+
+        Args:
+            world_mask: Which worlds.
+            options: Checked values, see `check_options`.
+        """
+        mask: NDArray[Any] = world_mask.numpy()
+        given = dict(options)
+        if "object" in given:
+            self.occupancy.ask(given.pop("object"), mask)
+        self.draw(world_mask)
+        self.occupancy.ask_nothing()
+        if given:
+            values: NDArray[Any] = self.values.numpy().copy()
+            for name, numbers in given.items():
+                values[mask, self.columns(name)] = numbers[mask]
+            self.values.assign(values)
+
+
+class Materials:
+    """Materials and sizes of all soft bodies, which follow the parameters of their worlds.
+
+    Args:
+        solver: What they are set in.
+        table: The parameters.
+        stride: Soft bodies of a world.
+        kept: For each choice of the occupancy the properties that are not drawn.
+
+    Attributes:
+        values: Each property by its name, shape (world_count * stride,).
+    """
+
+    NAMES = ("youngs_modulus", "poissons_ratio", "density", "friction", "scale")
+
+    def __init__(
+        self, solver: Any, table: ParameterTable, stride: int, kept: Sequence[Mapping[str, float]] = ({},)
+    ) -> None:
+        """Allocate the properties."""
+        worlds, device = table.world_count, table.values.device
+        self._solver, self._table, self._stride = solver, table, stride
+        self._all = wp.zeros((len(self.NAMES), worlds * stride), dtype=float, device=device)
+        self.values: dict[str, wp.array] = {name: cast(wp.array, self._all[k]) for k, name in enumerate(self.NAMES)}
+        self._columns = wp.array([table.column(name) for name in self.NAMES], dtype=int, device=device)
+        own = [[each.get(name, math.nan) for name in self.NAMES] for each in kept]
+        self._own = wp.array(own, dtype=float, device=device)
+        self._mask = wp.zeros(worlds + 1, dtype=wp.bool, device=device)
+
+    def apply(self, world_mask: wp.array) -> None:
+        """Give the bodies of the masked worlds the materials and sizes of their parameters; capturable."""
+        held, values = self._table.occupancy, self._all
+        inputs = (self._table.values, self._stride, self._columns, self._own, held.choice, held.slots)
+        launch(held.device, kernels.spread_materials, values.shape[1], *inputs, values)
+        wp.copy(self._mask, world_mask, count=world_mask.shape[0])
+        set_parameters(self._solver, self._mask, **self.values)
 
 
 def check_options(

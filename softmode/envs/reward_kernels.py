@@ -1,5 +1,6 @@
 """What the kernels of all tasks read and write, and what a touch, a grasp and a held goal are."""
 
+from enum import IntEnum
 from typing import Any
 
 import warp as wp
@@ -9,6 +10,24 @@ TOUCH_FORCE = wp.constant(0.02)
 
 NEAR = wp.constant(0.02)
 """How far the tool may be beyond an object's farthest point where fingers that feel something hold that object [m]."""
+
+
+class EndReason(IntEnum):
+    """Why an episode ended, ``info["end_reason"]``; what comes after TIME_LIMIT is a failure and terminates.
+
+    The limit of a single environment is that of Gymnasium's ``TimeLimit`` around it, which info does not tell.
+    """
+
+    RUNNING = 0
+    TIME_LIMIT = 1
+    DIVERGED = 2
+    """A number of the world's state was not finite."""
+    DROPPED = 3
+    """The object fell off the table."""
+    SPILLED = 4
+    """Another object left the container that it belongs in."""
+    FAILED = 5
+    """A rule of the task itself was broken: its `evaluate` wrote so."""
 
 
 @wp.struct
@@ -27,7 +46,7 @@ class WorldState:
     points: wp.array2d[int]  # those of object 0 that are observed, (world_count, points)
     stride: int  # soft objects per world
     slots: int  # of them those of a set, the first ones
-    occupant: wp.array[int]  # (world_count * slots,) which object of the set that is, -1 for none
+    choice: wp.array[int]  # (world_count * slots,) which object of the set that is, -1 for none
 
 
 @wp.struct
@@ -40,6 +59,7 @@ class StepResult:
     success: wp.array[wp.bool]
     failure: wp.array[int]  # an EndReason
     held: wp.array[int]  # control steps in a row in which the goal was met
+    at_goal: wp.array[int]  # bit o: object o may be let go where it is, which is no drop
     marker_place: wp.array[wp.transform]
 
 
@@ -67,7 +87,7 @@ def is_there(state: WorldState, world: int, o: int):
     """Return whether a world has its object o."""
     if o >= state.slots:
         return True
-    return state.occupant[world * state.slots + o] >= 0
+    return state.choice[world * state.slots + o] >= 0
 
 
 @wp.func

@@ -104,6 +104,13 @@ def with_robot(config: Config, robot: Robot) -> Config:
         up = np.array([0.0, 0.0, tip_length(robot) - tip_length(arm)])
         lower, upper = (tuple((corner + up).tolist()) for corner in (control.workspace_lower, control.workspace_upper))
         control = replace(control, workspace_lower=lower, workspace_upper=upper)
+    if robot.share < 1.0:  # the box shrinks about the middle of the places, and still holds what does not move
+        ends = [np.array(control.workspace_lower), np.array(control.workspace_upper)]
+        middle = np.array([*scene.object_position, ends[0][2]])
+        corners = [middle + robot.share * (end - middle) for end in ends]
+        corners = np.array([*corners, robot.home_position, *config.spots()])
+        lower, upper = (tuple(corner.tolist()) for corner in (corners.min(axis=0), corners.max(axis=0)))
+        control = replace(control, workspace_lower=lower, workspace_upper=upper)
     # Loops and joint limits of a gripper take rows of their own.
     more = len(robot.robot.joint_names) + 6 * robot.robot.mjcf.count("<connect")
     shapes = int(np.count_nonzero(robot.robot.model.geom_contype))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,11 +12,12 @@ from scipy.spatial.transform import Rotation
 
 from softmode.deformables.reduction.body_modes import surface_modes
 from softmode.envs.reward_kernels import TOUCH_FORCE
-from softmode.envs.scripted_base import Environment, ScriptedPolicy, Vector, bounded
+from softmode.envs.scripted import Environment, ScriptedPolicy, Vector, bounded
 from softmode.errors import GraspError
 from softmode.objects.soft_object import SoftObject
 from softmode.robots.grasp_planner import Grasp, plan_grasps
 from softmode.robots.jaws import ParallelJaw
+from softmode.robots.table_robot import TableRobot
 
 
 @functools.lru_cache(maxsize=64)
@@ -182,7 +184,16 @@ class ScriptedGrasp(ScriptedPolicy):
                 return None
             raise
         self.trouble = ""
+        found = [held for grasp in found if (held := self._held(grasp)) is not None] or found
         return found[self._attempts % len(found)]
+
+    def _held(self, grasp: Grasp) -> Grasp | None:
+        """Return a grasp that the arm reaches from above, with half a turn where it must; None if it does not."""
+        if not isinstance(self.arm, TableRobot):
+            return grasp
+        place = np.array(grasp.position)
+        yaw = self.arm.turn_at(np.array([place, [*place[:2], place[2] + self.CLEARANCE]]), grasp.yaw)
+        return None if yaw is None else replace(grasp, yaw=yaw)
 
     def _weight(self) -> float:
         """Return the weight of the object [N]."""

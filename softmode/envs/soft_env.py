@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import copy
+import importlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 import gymnasium as gym
 import numpy as np
@@ -14,35 +15,30 @@ from numpy.typing import ArrayLike, NDArray
 
 from softmode.deformables.model.status import status_reasons
 from softmode.deformables.reduction.build_body import Progress
+from softmode.deformables.tools.gaps import warn_of_overlaps
 from softmode.envs.arguments import (
+    LOOK_ON,
     RENDER_MODES,
     Shortcuts,
+    TaskEnv,
+    TaskT,
     checked_actions,
     checked_config,
     checked_device,
     checked_options,
     world_seed,
 )
-from softmode.envs.end_reason import EndReason
-from softmode.envs.env_state import (
-    EnvState,
-    checked_state,
-    generator_of,
-    generator_state,
-    set_worlds_state,
-    worlds_state,
-)
+from softmode.envs.env_state import EnvState, checked_state, generator_of, generator_state
 from softmode.envs.parameters import check_options
-from softmode.envs.results import host_view, info_arrays, name_of, observation_arrays, take, write
+from softmode.envs.results import name_of, take
+from softmode.envs.reward_kernels import EndReason
 from softmode.envs.robots import Robot
-from softmode.envs.task import Task
 from softmode.envs.task_config import ObservationType, TaskConfig
-from softmode.errors import ConfigError
-from softmode.pause import collector_paused
-from softmode.vector_check.tensors import map_tree
+from softmode.envs.worlds import LocalWorlds
+from softmode.errors import ConfigError, needs_extra
 
 
-class SoftEnv(gym.Env, gym.utils.EzPickle):
+class SoftEnv(TaskEnv[TaskT], gym.Env, gym.utils.EzPickle):
     """One arm at a table with soft objects; subclasses name the task.
 
     Actions, float32 in [-1, 1], larger ones are clamped: with ``control_mode="pose_delta"`` (x, y, z, yaw, gripper)
@@ -77,7 +73,8 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
 
     Args:
         obs_type: What ``reset`` and ``step`` return.
-        render_mode: "rgb_array" or None.
+        render_mode: "rgb_array"; "human" for a page in the browser that shows every step, with the extra `[viz]`; or
+            None.
         control_mode: What actions mean.
         splat: Splat file of the object; None for the built-in one.
         size: Longest edge of the object [m].
@@ -94,9 +91,9 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
         AssetError: If the splat file cannot be used.
     """
 
-    metadata = {"render_modes": list(RENDER_MODES), "render_fps": 30}  # noqa: RUF012  (gymnasium's own convention)
-    task_class: ClassVar[type[Task]] = Task
-    """The task."""
+    metadata = {"render_modes": [*RENDER_MODES, LOOK_ON], "render_fps": 30}  # noqa: RUF012  (gymnasium's own convention)
+    task: TaskT
+    """The task in one world."""
 
     def __init__(
         self,
@@ -126,30 +123,28 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
         # What a copy is made from when the environment is pickled; a callback cannot travel.
         place = None if device is None else str(device)
         gym.utils.EzPickle.__init__(self, **vars(given), config=config, device=place, **fields)
-        self.config = checked_config(self.task_class.config_class, config, given, self.task_class.any_robot, fields)
+        self.config = checked_config(
+            self.task_class.config_class, config, given, self.task_class.any_robot, fields, single=True
+        )
+        if render_mode == LOOK_ON:
+            with needs_extra("viz", 'render_mode="human" needs viser'):
+                import viser  # noqa: F401
         self.obs_type, self.render_mode = obs_type, render_mode
         self.metadata = {**self.metadata, "render_fps": round(self.config.scene.control_hz)}
-        with collector_paused():
-            self.task = self.task_class(
-                self.config,
-                obs_type=obs_type,
-                render=render_mode is not None,
-                device=checked_device(device),
-                progress=progress,
-            )
+        made = {"config": self.config, "obs_type": obs_type, "render": render_mode is not None}
+        self._worlds = LocalWorlds(self.task_class, {**made, "device": checked_device(device), "progress": progress})
+        self.task = self._worlds.task  # type: ignore[assignment]  # the one in the brackets
         self.scene, self.device = self.task.scene, self.task.device
+        self.action_space, self.observation_space = self._worlds.action_space, self._worlds.observation_space
+        self._result = self._worlds.result()
+        """What the last reset or step made: always the same memory."""
         self._begun = False
         """Whether an episode has begun."""
+        self._page: Any = None
         self._object_names = () if self.config.object_set is None else self.config.object_set.names
-        self.action_space = self.task.action_space
-        self.observation_space = self.task.observation_space()
-        task = self.task
-        made = (task.scene.actions, observation_arrays(task), info_arrays(task))
-        self._arrays = map_tree(host_view, (*made, task.reward, task.terminated, task.truncated))
-        """Actions, observation, infos, reward and ends of the last step: always the same memory."""
 
     def reset(self, *, seed: int | None = None, options: Mapping[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Start an episode."""
+        """Start an episode; what starts more than 1 mm inside something else is said in the log "softmode"."""
         given = checked_options(options)
         self._begun = True
         if "state" in given:
@@ -157,14 +152,16 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
                 raise ConfigError(
                     "a state excludes a seed and other options, it brings its own", hint="give the state alone"
                 )
-            self.set_state(checked_state(given["state"]))
-            self.task.begin()
+            self._set_state(checked_state(given["state"]), begin=True)
+            self._look_on()
             return self._observe(), self._info()
-        given = check_options(self.task.reset_options, given, 1)
+        given = check_options(self.task.table.options, given, 1)
         fresh = seed is not None or self._np_random is None
         super().reset(seed=seed)
-        seeds = np.array([world_seed(self.np_random)]) if fresh else None
-        self.task.reset(seeds=seeds, options=given)
+        seed = world_seed(self.np_random) if fresh else -1
+        self._worlds.reset(np.ones(1, bool), np.array([seed]), given)
+        warn_of_overlaps(self.scene.solver, self.scene.state, self.scene.dt)
+        self._look_on()
         return self._observe(), self._info()
 
     def step(self, action: ArrayLike) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -175,12 +172,10 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
         """
         if not self._begun:
             raise ConfigError("step comes before the first reset", hint="call reset() first")
-        given = checked_actions(action, self.action_space)[None]
-        actions, _, _, *ends = self._arrays
-        write(given, actions)
-        self.task.step()
-        info = self._info()
-        reward, terminated, truncated = take(ends, 0, scalars=True)
+        self._worlds.step(checked_actions(action, self.action_space)[None])
+        self._look_on()
+        info, made = self._info(), self._result
+        reward, terminated, truncated = (take(made[n], 0, scalars=True) for n in ("reward", "terminated", "truncated"))
         if terminated:
             info["failure"] = EndReason(info["end_reason"]).name.lower()
         return self._observe(), reward, terminated, truncated, info
@@ -191,7 +186,7 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
         Raises:
             ConfigError: If the scene has grips, which are not part of a state.
         """
-        owner, arrays = worlds_state(self.task)
+        owner, arrays = self._worlds.get_state()
         return EnvState(owner=owner, arrays=arrays, random=(generator_state(self._np_random),))
 
     def set_state(self, state: EnvState | bytes) -> None:
@@ -205,12 +200,15 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
         Raises:
             StateError: If it is damaged, or of another version, task, robot or object; nothing has changed then.
         """
-        state = checked_state(state)
+        self._set_state(checked_state(state), begin=False)
+
+    def _set_state(self, state: EnvState, *, begin: bool) -> None:
+        """Go on from a state; `begin` lets an episode begin there."""
         if state.world_count != 1:
             raise ConfigError(f"the state has {state.world_count} worlds", hint="choose one with state.worlds([0])")
         random = generator_of(state.random[0])
         self._begun = True
-        set_worlds_state(self.task, state.owner, state.arrays, np.ones(1, bool))
+        self._worlds.set_state(state.owner, state.arrays, np.ones(1, bool), begin)
         self._np_random = random
 
     def twin(self, **changes: Any) -> Self:
@@ -231,17 +229,35 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return the views of the rendering cameras side by side, uint8 (render_size, 2 render_size, 3)."""
-        if self.render_mode is None:
+        if self.render_mode != "rgb_array":
             return None
-        return self.task.draw_film()[0]
+        return self._worlds.render()[0]
+
+    @property
+    def page_url(self) -> str | None:
+        """Where the page of ``render_mode="human"`` is, from the first reset on; None in other modes."""
+        return None if self._page is None else self._page.url
+
+    def close(self) -> None:
+        """End the page, if there is one."""
+        if self._page is not None:
+            self._page.close()
+            self._page = None
+
+    def _look_on(self) -> None:
+        """Show the present state to who looks on."""
+        if self.render_mode == LOOK_ON:
+            if self._page is None:  # loaded by name: a room above this one
+                self._page = importlib.import_module("softmode.view.env_page").EnvPage(self)
+            self._page.show()
 
     def _observe(self) -> Any:
         """Return the observation in arrays of its own."""
-        return take(self._arrays[1], 0)
+        return take(self._result["observation"], 0)
 
     def _info(self) -> dict[str, Any]:
         """Return the info of the present state."""
-        info = take(self._arrays[2], 0, scalars=True)
+        info = take(self._result["info"], 0, scalars=True)
         info["solver_reasons"] = status_reasons(info["solver_status"])
         if self._object_names:
             info["object_name"] = name_of(info["object"], self._object_names)

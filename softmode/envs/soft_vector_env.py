@@ -6,7 +6,7 @@ import copy
 import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Self, get_args
+from typing import Any, Literal, Self, cast, get_args
 
 import gymnasium as gym
 import numpy as np
@@ -19,8 +19,9 @@ from numpy.typing import ArrayLike, NDArray
 from softmode.checks import require_choice
 from softmode.deformables.reduction.build_body import Progress
 from softmode.envs.arguments import (
-    RENDER_MODES,
     Shortcuts,
+    TaskEnv,
+    TaskT,
     checked_actions,
     checked_config,
     checked_count,
@@ -33,7 +34,6 @@ from softmode.envs.env_state import EnvState, checked_state, generator_of, gener
 from softmode.envs.parameters import check_options
 from softmode.envs.results import add_object_names, named_reasons
 from softmode.envs.robots import Robot
-from softmode.envs.task import Task
 from softmode.envs.task_config import ObservationType, TaskConfig
 from softmode.envs.worlds import LocalWorlds, RemoteWorlds
 from softmode.errors import ConfigError, MissingExtraError
@@ -42,7 +42,7 @@ from softmode.vector_check.tensors import Tensor, host_array, map_tree
 Output = Literal["numpy", "torch"]
 
 
-class SoftVectorEnv(gym.vector.VectorEnv):
+class SoftVectorEnv(TaskEnv[TaskT], gym.vector.VectorEnv):
     """`num_envs` worlds of a task; subclasses name the task. See :class:`SoftEnv` for actions, observations and infos.
 
     Infos are dicts of arrays over the worlds, each with its mask ``_key``. With SAME_STEP autoreset ``final_obs`` and
@@ -77,10 +77,6 @@ class SoftVectorEnv(gym.vector.VectorEnv):
         MissingExtraError: If torch is asked for and not installed.
     """
 
-    metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 30}  # noqa: RUF012  (gymnasium's convention)
-    task_class: ClassVar[type[Task]] = Task
-    """The task."""
-
     def __init__(
         self,
         num_envs: int = 1,
@@ -102,24 +98,6 @@ class SoftVectorEnv(gym.vector.VectorEnv):
         **fields: Any,
     ) -> None:
         """Build the scene, capture the step and make the spaces."""
-        self._arguments = {
-            "num_envs": num_envs,
-            "obs_type": obs_type,
-            "render_mode": render_mode,
-            "control_mode": control_mode,
-            "splat": splat,
-            "size": size,
-            "preset": preset,
-            "robot": robot,
-            "config": config,
-            "max_episode_steps": max_episode_steps,
-            "autoreset_mode": autoreset_mode,
-            "output": output,
-            "processes": processes,
-            "device": device,
-            **fields,
-        }
-        """What a copy is made from; a callback is not."""
         self.num_envs = checked_count("num_envs", num_envs)
         if max_episode_steps is not None:
             max_episode_steps = checked_count("max_episode_steps", max_episode_steps)
@@ -138,6 +116,18 @@ class SoftVectorEnv(gym.vector.VectorEnv):
             preset=preset,
             robot=robot,
         )
+        self._arguments = {
+            **vars(given),
+            "num_envs": num_envs,
+            "config": config,
+            "max_episode_steps": max_episode_steps,
+            "autoreset_mode": autoreset_mode,
+            "output": output,
+            "processes": processes,
+            "device": device,
+            **fields,
+        }
+        """What a copy is made from; a callback is not."""
         config = checked_config(self.task_class.config_class, config, given, self.task_class.any_robot, fields)
         if output == "torch":
             try:
@@ -316,7 +306,7 @@ class SoftVectorEnv(gym.vector.VectorEnv):
             worlds.close()
 
     @property
-    def task(self) -> Task:
+    def task(self) -> TaskT:
         """The task, if all worlds live in this process.
 
         Raises:
@@ -324,7 +314,7 @@ class SoftVectorEnv(gym.vector.VectorEnv):
         """
         if not isinstance(self._worlds[0], LocalWorlds):
             raise ConfigError("the worlds live in other processes", hint="make the environment with processes=1")
-        return self._worlds[0].task
+        return cast(Any, self._worlds[0].task)  # the one in the brackets
 
     @property
     def state_observation(self) -> Any:

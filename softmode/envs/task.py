@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, ClassVar, cast
+from functools import partial
+from typing import Any, ClassVar
 
-import gymnasium as gym
 import numpy as np
 import warp as wp
 from gymnasium.vector import AutoresetMode
@@ -15,53 +15,44 @@ from numpy.typing import ArrayLike, NDArray
 
 from softmode.deformables.body.rkpm import sample_farthest
 from softmode.deformables.materials.material import Material
-from softmode.deformables.model import status as bits
 from softmode.deformables.model.compile_ahead import compile_launches, compiling_aside
 from softmode.deformables.model.structs import filled
 from softmode.deformables.reduction.build_body import Progress
-from softmode.deformables.tools.parameters import set_parameters
 from softmode.envs import task_kernels as kernels
-from softmode.envs.cameras import FollowCamera, overview, square_camera, wrist_camera
-from softmode.envs.clutter import Arcs, clutter_parameters
-from softmode.envs.end_reason import EndReason
+from softmode.envs.cameras import overview, square_camera, wrist_camera
+from softmode.envs.episodes import FALL, Episodes
+from softmode.envs.film import TaskFilm
 from softmode.envs.handling import Handling
 from softmode.envs.observation import (
-    ObservationLayout,
+    ObservationTable,
     Segment,
     object_part,
     one_hot_part,
     others_part,
     proprioception,
 )
-from softmode.envs.parameters import Parameter, ParameterTable
-from softmode.envs.reward_kernels import StepResult, WorldState
+from softmode.envs.parameters import Materials, Parameter, ParameterTable
+from softmode.envs.pictures import Pictures
+from softmode.envs.placement import Arcs, Placement, clutter_parameters
+from softmode.envs.reward_kernels import EndReason, StepResult, WorldState
 from softmode.envs.task_config import ObservationType, TaskConfig
 from softmode.errors import ConfigError, GraspError
-from softmode.objects.loader import load
 from softmode.objects.rest_grasps import rest_grasps
-from softmode.objects.soft_object import SoftObject
 from softmode.robots.jaws import ParallelJaw
 from softmode.scenes.capture import capture_graph
-from softmode.scenes.table_scene import GAP, TableScene, TableSceneConfig
+from softmode.scenes.occupancy import Occupancy
+from softmode.scenes.table_scene import Marker, TableScene, TableSceneConfig
 from softmode.splats.cameras.camera import CameraOptions
 from softmode.splats.raster.pinhole import PinholeCamera
-from softmode.splats.splats import Splats
-
-FALL = 0.05
-"""How far under its resting height on the table object 0 counts as dropped [m]."""
-HAND = 0.07
-"""Radius about the tool that the following camera shows [m]."""
-MARKER = 0.02
-"""Radius about the goal that the following camera shows [m]."""
-MATERIAL = ("youngs_modulus", "poissons_ratio", "density", "friction", "scale")
-"""Parameters of the soft bodies."""
+from softmode.stages import stage
 
 
 class Task:
     """A task in `world_count` worlds; subclasses add goals and rewards.
 
-    A subclass names its `terms` and `metrics`, may extend `parameters` and `goal_segments`, and overrides the methods
-    of the section "what a task adds", which only launch kernels, because `step` is captured as one graph.
+    A subclass names its `step_kernels`, `term_names` and `metric_names`, may extend `parameters` and `goal_segments`,
+    and overrides methods of the section "what a task adds", which only launch kernels, because the step is captured as
+    one graph.
 
     Args:
         config: The task's configuration.
@@ -69,21 +60,34 @@ class Task:
         world_count: Number of worlds.
         limit: Control steps per episode, 0 for no limit.
         autoreset_mode: When a world whose episode ended starts the next one; DISABLED leaves that to `reset`.
-        render: Whether `render` will be asked for.
+        render: Whether frames will be asked for.
         device: Warp device.
         progress: Reports the build of the objects.
 
     Attributes:
+        scene: Physics and cameras.
+        table: What was drawn at reset.
+        materials: Material and scale of every soft object.
+        layout: Where the segments of the observation stand.
+        segments: Columns of each of them by name.
+        episodes: How far each episode is, what it earns, how it ends.
+        handling: How gently the objects are handled.
+        placement: Puts objects down.
+        pictures: What the cameras of an observation draw.
+        film: What people watch.
         observation: Bounded observation vector, float32, shape (world_count, D).
-        final_observation: That at the end of the last episode, before the reset of SAME_STEP.
         terms: Reward terms, shape (world_count, T), `term_names`.
         metrics: Task-specific figures, shape (world_count, M), `metric_names`.
-        reward: Sum of the terms, or as `TaskConfig.reward_mode` says, shape (world_count,).
-        terminated: Whether the episode ended by a failure.
-        truncated: Whether it ended by its limit.
         success: Whether the task counts as solved now.
-        end: `EndReason` of the step.
-        done: terminated or truncated.
+        outcome: What a step came to, by name.
+        final_outcome: What the last step of the last episode came to, before the reset of SAME_STEP.
+        rest_height: Height of the centre of every unscaled object 0 over the table at rest [m], shape (world_count,).
+        points: Surface samples of object 0 in the observation: those of world 0, and of all that have its object.
+        points_of_choices: The same of every choice of the scene's occupancy, shape (choices, point_count).
+        state: What kernels read, a `WorldState`.
+        result: What they write, a `StepResult`.
+        plan: What the task's own kernels know beside it.
+        graph: The step as a captured graph.
     """
 
     config_class: ClassVar[type[TaskConfig]] = TaskConfig
@@ -106,11 +110,16 @@ class Task:
     takes_several: ClassVar[bool] = False
     """Whether worlds may have several objects of the set (`ObjectSet.per_world`): object 0 is that of the task, the
     others lie beside it, see `other_arcs`."""
+    filmed_across: ClassVar[bool] = False
+    """Whether the film's first camera looks across the direction in which the fingers close."""
+    goal_ring: ClassVar[bool] = False
+    """Whether films show the goal as a ring about where the object is to be, in place of the marker."""
     any_robot: ClassVar[bool] = False
     """Whether the task has been tried with robots from files, which `robot` names."""
-    kernels: ClassVar[Any] = None
-    """Device side that `observe` and `evaluate` launch, a module with kernels of these names and a struct `Plan`: first
-    columns of parameters (`drawn`) and segments (`columns`), and what has the name of an attribute of the task, its
+    step_kernels: ClassVar[tuple[Any, Any] | None] = None
+    """The kernels that `observe` and `evaluate` launch; both take (`WorldState`, plan, `StepResult`), where plan is a
+    struct of the task's own. Its fields are found by their names: ``drawn_NAME`` and ``column_NAME`` are the first
+    columns of a parameter and of a segment of the observation, any other is an attribute of the task, its
     configuration, the controller's options or the first object. None where a task overrides both methods."""
 
     def __init__(
@@ -126,215 +135,95 @@ class Task:
         progress: bool | Progress | None = None,
     ) -> None:
         """Build the scene and allocate what a step writes."""
-        self.config, self.obs_type, self.world_count = config, obs_type, world_count
-        self.object_set = config.object_set
-        """The objects of which every world gets one; None where all have the same."""
-        if self.object_set is not None and not self.takes_sets:
-            raise ConfigError(
-                f"{type(self).__name__} cannot have another object in every world, objects is a set of"
-                f" {self.object_set.count}",
-                hint="give config.scene.object one object; a task of yours may set takes_sets",
-            )
-        self.slots = 1 if self.object_set is None else self.object_set.number_range[1]
-        """How many objects of the set a world has room for."""
-        if self.slots > 1 and not self.takes_several:
-            raise ConfigError(
-                f"{type(self).__name__} has one object per world, objects.per_world asks for {self.slots}",
-                hint="leave per_world out, or take LiftSoft, PushSoft or PlaceInBin",
-            )
-        self.limit, self.autoreset_mode = limit, autoreset_mode
-        cameras = []
-        if obs_type != "state":
-            cameras.append(self.observation_camera())
-        if render:
-            cameras += self.render_cameras()  # for recorders, in fixed places
-        labelled = "segmentation" in config.image_outputs
-        options = CameraOptions(mesh_samples=config.mesh_samples, segmentation=labelled)
-        with compiling_aside(device):
-            self.scene = TableScene(
+        self.config, self.obs_type, self.world_count, self.autoreset_mode = (
+            config,
+            obs_type,
+            world_count,
+            autoreset_mode,
+        )
+        _check_set(type(self), config)
+        cameras = [self.observation_camera()] if obs_type != "state" else []
+        film = self.render_cameras() if render else []  # for recorders, in fixed places
+        with stage("making the environment"), compiling_aside(device):
+            self.scene = scene = TableScene(
                 self.scene_config(),
                 world_count=world_count,
-                cameras=cameras,
-                film=self.render_cameras() if render else (),
-                camera_options=options,
+                cameras=[*cameras, *film],
+                film=film,
+                camera_options=CameraOptions(
+                    mesh_samples=config.mesh_samples, segmentation="segmentation" in config.image_outputs
+                ),
                 camera_randomization=config.camera_randomization,
-                marker=self.marker() if cameras else None,
+                marker=self.marker() if cameras or film else None,
                 device=device,
                 progress=progress,
             )
-            self._lay_out()
-            compile_launches(self._launches, self.device)
+            self.device, held = scene.device, scene.occupancy
+            if config.object_set is not None and self.grasps:
+                _check_grasps(held, ParallelJaw.of(config.scene.arm))
+            kept = [_kept(config, material) for material in held.materials]
+            self.table = ParameterTable(self.parameters(), held, kept)
+            self.materials = Materials(scene.solver, self.table, len(scene.objects), kept)
+            points = [sample_farthest(thing.body.surface_points, self.point_count, first=0) for thing in held.choices]
+            self.points_of_choices: NDArray[np.intp] = np.stack(points)
+            self.points = self.points_of_choices[held.rows[0]]
+            heights = np.array([thing.height for thing in held.choices])
+            self.rest_height, lowest = held.follow(heights), held.follow(heights - FALL)
+            self.layout = _layout(self)
+            self.segments, self.observation = self.layout.segments, self.layout.values
+            sparse = config.reward_mode == "sparse" and not config.terms_follow_mode
+            counts = {"terms": len(self.term_names), "metrics": len(self.metric_names)}
+            self.episodes = Episodes(world_count, **counts, limit=limit, sparse=sparse, device=self.device)
+            self.terms, self.metrics, self.success = self.episodes.terms, self.episodes.metrics, self.episodes.success
+            limits = (config.strain_limit, config.force_limit)
+            self.handling = Handling(scene, self.table.column("friction"), *limits)
+            self.outcome: dict[str, wp.array] = {
+                "success": self.success,
+                "safe": self.handling.safe,
+                "handled": self.handling.handled,
+                "metrics": self.metrics,
+                "parameters": self.table.values,
+                "observation": self.observation,
+                "status": scene.solver.status,
+                "object": held.by_world,
+            }
+            self.final_outcome = {name: wp.zeros_like(array) for name, array in self.outcome.items()}
+            self.state = filled(
+                WorldState,
+                scene,
+                scene.controller,
+                scene.model.softmode,
+                scene.state,
+                parameters=self.table.values,
+                points=held.follow(self.points_of_choices, int),
+                q=scene.state.softmode.q,
+                stride=len(scene.objects),
+                slots=held.slots,
+                choice=held.choice,
+            )
+            written = {"observation": self.observation, "marker_place": scene.marker_place}
+            self.result = filled(StepResult, self.episodes, self.handling, **written)
+            self._arm = filled(kernels.ArmState, scene.controller, scene.state)
+            self._finish = partial(
+                self.episodes.finish,
+                state=self.state,
+                result=self.result,
+                status=scene.solver.status,
+                finite=self.layout.finite,
+                lowest=lowest,
+            )
+            self.placement = Placement(scene, self.table, self.state)
+            edge = config.image_size if cameras else None
+            keep_last = autoreset_mode == AutoresetMode.SAME_STEP
+            self.pictures = Pictures(scene, edge, config.image_outputs, keep_last=keep_last)
+            self.film = TaskFilm(self)
+            self.build()
+            self.plan = None if self.step_kernels is None else plan_of(self, self.step_kernels[0])
+            judge = partial(self.judge, self.episodes.never)
+            for launches in (self.before_step, self.handling.watch, judge, self.clear):
+                compile_launches(launches, self.device)
         self.reset()
         self.graph = capture_graph(self._step, self.device)
-        """The step as a captured graph."""
-
-    def _lay_out(self) -> None:
-        """Lay out observations and parameters, and allocate what a step writes."""
-        config, world_count = self.config, self.world_count
-        self._follow = FollowCamera(self.render_cameras()[0], world_count)
-        self.device = self.scene.device
-        self._check_objects()
-        kept = [self._kept(material) for material in self.scene.materials]
-        self.table = ParameterTable(self.parameters(), world_count, self.device, kinds=kept, kind=self.scene.member)
-        self._rows: list[tuple[wp.array, wp.array, bool]] = []
-        members = self.scene.members
-        points = [sample_farthest(thing.body.surface_points, self.point_count, first=0) for thing in members]
-        self._points: NDArray[np.intp] = np.stack(points)
-        self.points = self.points_of_worlds[0]
-        """Those of world 0, and of all worlds that have the same object."""
-        heights = np.array([thing.height for thing in members])
-        self.rest_height = self.per_object(heights)
-        """Height of the centre of every unscaled object 0 over the table at rest [m], shape (world_count,)."""
-        given = self.object_set
-        code = one_hot_part(given.count, self.slots) if given is not None and config.objects_one_hot else ()
-        beside = others_part(self.slots - 1)
-        proprioception_and_goal = (*proprioception(self.scene.controller.joint_count), *self.goal_segments())
-        self.layout = ObservationLayout(
-            (*proprioception_and_goal, *object_part(self.point_count), *self.object_segments(), *beside, *code)
-        )
-        self.segments = self.layout.segments
-        """Columns of each segment: proprioception, goal, object, and what a task adds about it."""
-        self.low, self.high = self.layout.low, self.layout.high
-        self.agent_size = sum(segment.size for segment in proprioception_and_goal)
-        """Leading columns of the observation that do not see the object: proprioception and goal."""
-        self._allocate()
-        self.build()
-        if self.kernels is not None:
-            columns = {
-                "drawn": self.table.columns_in(self.kernels.Drawn),
-                "columns": self.layout.columns_in(self.kernels.Columns),
-            }
-            self.plan = filled(self.kernels.Plan, self, config, config.scene.control, self.scene.soft, **columns)
-            """What the task's own kernels know beside the state."""
-
-    @property
-    def member_names(self) -> tuple[str, ...]:
-        """What messages call each member of the scene, see `TableScene.members`."""
-        given, scene = self.object_set, self.scene
-        if given is None:
-            return ("the object",)
-        held = range(given.count) if scene.resampled else np.unique(scene.chosen).tolist()
-        return tuple(f"objects: {given.names[k]}" for k in held)
-
-    @property
-    def points_of_worlds(self) -> NDArray[np.intp]:
-        """Surface samples of object 0 in the observation, shape (world_count, point_count)."""
-        return self._points[self.scene.member]
-
-    @property
-    def reset_options(self) -> dict[str, Parameter]:
-        """What a reset option may set, by name: the parameters, and with `ObjectSet.resample` the object."""
-        given = self.object_set
-        if given is None or not given.resample:
-            return self.table.parameters
-        low, high = (0.0, *[-1.0] * (self.slots - 1)), (given.count - 1.0,) * self.slots
-        return {**self.table.parameters, "object": Parameter(name="object", low=low, high=high)}
-
-    def per_object(self, values: ArrayLike, dtype: type = float, *, every_slot: bool = False) -> wp.array:
-        """Return an array with a row per world: that of its object, which follows it where a reset may change it.
-
-        Args:
-            values: A row per member of the scene, see `TableScene.members`.
-            dtype: Type of the array, of a multiple of 32 bits.
-            every_slot: Whether the second axis has an entry per slot, which follows the object there.
-        """
-        table = np.asarray(values)
-        array = wp.array(table[self.scene.member], dtype=dtype, device=self.device)
-        if self.scene.resampled:
-            self._rows.append((wp.array(table, dtype=dtype, device=self.device), array, every_slot))
-        return array
-
-    def column(self, segment: str) -> int:
-        """Return the first column of a segment of the observation."""
-        return self.layout.column(segment)
-
-    def _allocate(self) -> None:
-        """Make the arrays that a step writes."""
-        worlds, device = self.world_count, self.device
-
-        def zeros(*shape: int, dtype: type = float) -> wp.array:
-            return wp.zeros((worlds, *shape), dtype=dtype, device=device)
-
-        self.seed, self.episode, self.elapsed, self.end, self.failure = (zeros(dtype=int) for _ in range(5))
-        self.held = zeros(dtype=int)
-        """Control steps in a row in which the goal was met, counted by `evaluate`."""
-        self.terminated, self.truncated, self.success, self.done, self.finite = (zeros(dtype=wp.bool) for _ in range(5))
-        self.observation = zeros(len(self.low))
-        self.reward = zeros()
-        self.terms = zeros(max(len(self.term_names), 1))
-        self.metrics = zeros(max(len(self.metric_names), 1))
-        config = self.config
-        self.handling = Handling(self.scene, self.table.column("friction"), config.strain_limit, config.force_limit)
-        """How gently the objects are handled."""
-        self.outcome: dict[str, wp.array] = {
-            "success": self.success,
-            "safe": self.handling.safe,
-            "handled": self.handling.handled,
-            "metrics": self.metrics,
-            "parameters": self.table.values,
-            "observation": self.observation,
-            "status": self.scene.solver.status,
-            "object": self.scene.object_index,
-        }
-        """What a step came to."""
-        self.final_outcome = {name: wp.zeros_like(array) for name, array in self.outcome.items()}
-        """What the last step of the last episode came to, before the reset of SAME_STEP."""
-        self.final_observation = self.final_outcome["observation"]
-        self.never = zeros(dtype=wp.bool)
-        """A mask of no world."""
-        self._fresh = zeros(dtype=wp.bool)
-        self.any_done = wp.zeros(1, dtype=int, device=device)
-        scene, instances = self.scene, worlds * len(self.scene.objects)
-        self._material = wp.zeros((len(MATERIAL), instances), dtype=float, device=device)
-        self.materials = {name: cast(wp.array, self._material[k]) for k, name in enumerate(MATERIAL)}
-        """Material and scale of every soft object by name, each of shape (world_count * objects,)."""
-        columns = [self.table.column(name) for name in MATERIAL]
-        self._material_columns = wp.array(columns, dtype=int, device=device)
-        self._solver_mask = wp.zeros(worlds + 1, dtype=wp.bool, device=device)
-        others = [thing.height for thing in scene.objects[self.slots :]]
-        heights = np.array([[*[thing.height] * self.slots, *others] for thing in scene.members])
-        self._heights = self.per_object(heights, every_slot=self.slots > 1)
-        self._lowest = self.per_object(heights[:, 0] - FALL)
-        given = self.object_set
-        self._ends = wp.array([1.0] if given is None else given.ends, dtype=float, device=device)
-        self._wanted = wp.full(worlds * self.slots, int(kernels.UNASKED), dtype=int, device=device)
-        self.object_index = scene.object_index
-        """Which object of the set each world has, see `TableScene.object_index`."""
-        self._choice: wp.array = scene.object_index.flatten()  # the same memory
-        own = [[kept.get(name, math.nan) for name in MATERIAL] for kept in map(self._kept, scene.materials)]
-        self._own_materials = wp.array(own, dtype=float, device=device)
-        self._no_shift = zeros()
-        self._low = wp.array(self.low, dtype=float, device=device)
-        self._high = wp.array(self.high, dtype=float, device=device)
-        self.state = filled(
-            WorldState,
-            scene,
-            scene.controller,
-            scene.model.softmode,
-            scene.state,
-            parameters=self.table.values,
-            points=self.per_object(self._points, int),
-            q=scene.state.softmode.q,
-            stride=len(scene.objects),
-            slots=self.slots,
-            occupant=self._choice,
-        )
-        """What the kernels of a task read."""
-        self.result = filled(StepResult, self, marker_place=scene.marker_place)
-        """What they write."""
-        self._arm = filled(kernels.ArmState, scene.controller, scene.state)
-        self._episode = filled(kernels.Episode, self)
-        self.images: dict[str, wp.array] = {}
-        """Pictures of the observation by key: pixels, depth, segmentation; shape (world_count, height, width, ...)."""
-        self.final_images: dict[str, wp.array] = {}
-        if self.obs_type != "state":
-            edge = self.config.image_size
-            camera = scene.cameras[edge, edge]
-            self.images["pixels"] = camera.images("pixels")
-            for name in self.config.image_outputs:
-                self.images[name] = camera.images("pixels", name)
-            if self.autoreset_mode == AutoresetMode.SAME_STEP:
-                self.final_images = {name: wp.zeros_like(image) for name, image in self.images.items()}
 
     # -- what a task adds ---------------------------------------------------------------------------------------------
 
@@ -352,28 +241,6 @@ class Task:
             scene = replace(scene, objects=given.resolved(scene.object).for_varied_ratio())
         first, *others = (thing.for_varied_ratio() for thing in (scene.object, *scene.others))
         return replace(scene, object=first, others=tuple(others))
-
-    def _check_objects(self) -> None:
-        """Refuse objects of a set that the gripper is to take and cannot.
-
-        Raises:
-            GraspError: If there is one; it names the object.
-        """
-        if self.object_set is None or not self.grasps:
-            return
-        scene, jaw = self.scene, ParallelJaw.of(self.config.scene.arm)
-        for name, thing, material in zip(self.member_names, scene.members, scene.materials, strict=True):
-            friction = max(math.sqrt(material.friction * jaw.friction), 1.0e-3)
-            try:
-                rest_grasps(thing.body, jaw, friction=friction)
-            except GraspError as error:
-                hint = "give it another size, or leave it out of the set"
-                raise GraspError(f"{name} does not fit the gripper: {error.message}", hint=hint) from error
-
-    def _kept(self, material: Material) -> dict[str, float]:
-        """Return the properties of a material that are not drawn."""
-        names = MATERIAL[: MATERIAL.index("scale")] if self.object_set is not None else ()
-        return {name: getattr(material, name) for name in names if getattr(self.config, f"{name}_range") is None}
 
     def other_arcs(self) -> Arcs:
         """Return in which directions from object 0 others of a set may lie; all around by default."""
@@ -404,14 +271,8 @@ class Task:
             ranged("density", 10.0, 2.0e4, log=True),
             ranged("friction", 0.0, 10.0),
             ranged("scale", 0.5, 2.0),
-            *self._clutter_parameters(),
+            *clutter_parameters(config, self.scene.occupancy, self.other_arcs()),
         )
-
-    def _clutter_parameters(self) -> tuple[Parameter, ...]:
-        """Return where objects beside object 0 lie."""
-        if self.slots == 1:
-            return ()
-        return clutter_parameters(self.config, self.slots - 1, self.scene.members, self.other_arcs())
 
     def goal_segments(self) -> tuple[Segment, ...]:
         """Return the segments of the observation that say what to reach."""
@@ -423,59 +284,44 @@ class Task:
 
     def place(self) -> None:
         """Write `place_position` and `place_yaw` of all objects of the worlds in `scene.world_mask`."""
-        self.place_object(0, "position", "yaw")
-        self.place_others()
+        self.placement.put(0)
+        self.placement.put_others()
 
     def clear(self) -> None:
         """Reset `held`, and counters of the subclass, in the worlds of `scene.world_mask`."""
-        self.launch(kernels.forget, [self.scene.world_mask, 0], [self.held])
+        self.launch(kernels.forget, [self.scene.world_mask, 0], [self.episodes.held])
 
     def before_step(self) -> None:
         """Change the worlds before each control step; part of the captured step."""
 
     def observe(self) -> None:
         """Write the goal segments of `observation` and the `metrics`, functions of the state alone."""
-        if self.kernels is not None:
-            self.launch(self.kernels.observe, [self.state, self.plan], [self.result])
+        if self.step_kernels is not None:
+            self.launch(self.step_kernels[0], [self.state, self.plan], [self.result])
 
     def evaluate(self) -> None:
         """Write `terms`, `success` and, for failures of the task's own, `failure` (an `EndReason`); once per step."""
-        if self.kernels is not None:
-            self.launch(self.kernels.evaluate, [self.state, self.plan], [self.result])
+        if self.step_kernels is not None:
+            self.launch(self.step_kernels[1], [self.state, self.plan], [self.result])
 
     def state_arrays(self) -> dict[str, wp.array]:
         """Return what episodes go on from beside the physics, by name, worlds first.
 
         Whoever keeps something from step to step that is no function of the physical state adds it.
         """
-        names = ("seed", "episode", "elapsed", "end", "failure", "held", "terminated", "truncated", "success", "done")
-        written = ("finite", "observation", "reward", "terms", "metrics")
-        own = {name: getattr(self, name) for name in (*names, *written)}
-        return {"parameters": self.table.values, **own, **self.handling.state_arrays()}
+        table, layout = self.table, self.layout
+        drawn = {"parameters": table.values, "seed": table.seed, "episode": table.episode}
+        names = ("elapsed", "end", "failure", "held", "terminated", "truncated", "success", "done")
+        judged = {name: getattr(self.episodes, name) for name in (*names, "reward", "terms", "metrics")}
+        kept = self.handling.state_arrays()
+        return {**drawn, **judged, **kept, "finite": layout.finite, "observation": layout.values}
 
-    def marker(self) -> Splats | Sequence[Splats] | None:
-        """Return the splats that mark the goal in pictures, a list for worlds that differ.
+    def marker(self) -> Marker | None:
+        """Return the splats that mark the goal in pictures, or what draws them for an object.
 
         `observe` writes `scene.marker_place`.
         """
         return None
-
-    def marker_per_object(self, draw: Callable[[SoftObject], Splats]) -> Splats | list[Splats]:
-        """Return a marker that depends on object 0; a list where the worlds differ, see `TableScene`.
-
-        Args:
-            draw: Makes the splats of an object.
-        """
-        scene = self.scene_config()
-        given = scene.objects
-        if given is None:
-            return draw(load(scene.object, material=scene.material))
-        chosen = np.arange(given.count) if given.resample else given.chosen(self.world_count)
-        drawn = {
-            k: draw(load(given.config(k), material=given.material(k, scene.material)))
-            for k in np.unique(chosen).tolist()
-        }
-        return drawn[chosen[0]] if len(drawn) == 1 and not given.resample else [drawn[k] for k in chosen.tolist()]
 
     def front_camera(self, name: str, edge: int) -> PinholeCamera:
         """Return the camera that looks at the object from the front, with pictures of `edge` x `edge` pixels."""
@@ -493,7 +339,7 @@ class Task:
         edge = self.config.render_size
         return [self.front_camera("front", edge), overview("overview", edge)]
 
-    # -- helpers for subclasses ---------------------------------------------------------------------------------------
+    # -- the step -----------------------------------------------------------------------------------------------------
 
     def launch(
         self,
@@ -513,53 +359,6 @@ class Task:
         dim = self.world_count if dim is None else dim
         wp.launch(kernel, dim=dim, inputs=list(inputs), outputs=list(outputs), device=self.device)
 
-    def place_object(
-        self,
-        index: int,
-        position: str,
-        yaw: str,
-        *,
-        ground: float = 0.0,
-        turn: float = 0.0,
-        shift: wp.array | None = None,
-    ) -> None:
-        """Put an object down.
-
-        Args:
-            index: Which object of a world.
-            position: The parameter that says where its centre is [m].
-            yaw: The one that says its rotation about the vertical [rad].
-            ground: Height over the table of what it stands on [m].
-            turn: What is added to the yaw [rad].
-            shift: From the centre of the unscaled object to what lies at the position, along the yaw [m], shape
-                (world_count,); None for the centre itself.
-        """
-        scene, names = self.scene, {"position": position, "yaw": yaw, "scale": "scale"}
-        columns = {field: self.table.column(name) for field, name in names.items()}
-        given = {
-            "turn": turn,
-            "shift": self._no_shift if shift is None else shift,
-            "gap": GAP + ground,
-            "object_index": index,
-        }
-        place = filled(kernels.Placement, **columns, **given, height=self._heights)
-        outputs = [scene.place_position, scene.place_yaw]
-        self.launch(kernels.place_object, [scene.world_mask, self.state, place], outputs)
-
-    def place_others(self) -> None:
-        """Put the objects of a set beside object 0 down, about it."""
-        scene, others = self.scene, self.slots - 1
-        if not others:
-            return
-        names = {"turn": "others_turn", "place": "other_place_1", "yaw": "other_yaw_1", "scale": "scale"}
-        columns = {field: self.table.column(name) for field, name in names.items()}
-        stride = self.table.column("other_place_2") - columns["place"] if others > 1 else 0
-        clutter = filled(kernels.Clutter, **columns, stride=stride, height=self._heights, gap=GAP)
-        inputs, outputs = [scene.world_mask, self.state, clutter], [scene.place_position, scene.place_yaw]
-        self.launch(kernels.place_beside, inputs, outputs, (self.world_count, others))
-
-    # -- episodes -----------------------------------------------------------------------------------------------------
-
     def reset(
         self,
         *,
@@ -576,130 +375,48 @@ class Task:
         """
         mask = np.ones(self.world_count, bool) if world_mask is None else np.asarray(world_mask, bool)
         if seeds is not None:
-            chosen, count = self.seed.numpy().copy(), self.episode.numpy().copy()
-            chosen[mask] = np.asarray(seeds, np.int64)[mask] & 0x7FFFFFFF
-            count[mask] = -1
-            self.seed.assign(chosen)
-            self.episode.assign(count)
+            chosen = self.table.use_seeds(seeds, mask)
             for camera in self.scene.cameras.values():
                 camera.variation.seed(chosen, mask)
-        self.scene.world_mask.assign(mask)
-        options = dict(options or {})
-        wanted = options.pop("object", None)
-        if wanted is not None:
-            asked = np.where(mask[:, None], np.rint(wanted), int(kernels.UNASKED)).astype(np.int32)
-            self._wanted.assign(asked.reshape(-1))
-        self._draw()
-        self._wanted.fill_(int(kernels.UNASKED))
-        if options:
-            values = self.table.values.numpy().copy()
-            for name, numbers in options.items():
-                values[mask, self.table.columns(name)] = numbers[mask]
-            self.table.values.assign(values)
-        self._start()
-        terms, end = self.terms.numpy().copy(), self.end.numpy().copy()
-        terms[mask], end[mask] = 0.0, EndReason.RUNNING
-        self.terms.assign(terms)
-        self.end.assign(end)
+        self.episodes.fresh.assign(mask)
+        self.restart(self.episodes.fresh, options)
+        self.episodes.forget(mask)
         self.write_observation()
-        self.draw_pictures()
+        self.pictures.draw()
 
-    def begin(self, mask: NDArray[np.bool_] | None = None) -> None:
-        """Let episodes begin in the masked worlds, all if None, from where they are: time counts from zero."""
-        chosen = np.ones(self.world_count, bool) if mask is None else mask
-        counts = (self.elapsed, self.terminated, self.truncated, self.done, self.end, self.terms, self.handling.handled)
-        for array in counts:
-            values = array.numpy().copy()
-            values[chosen] = 0
-            array.assign(values)
-
-    def _draw(self) -> None:
-        """Draw the parameters of the worlds in `scene.world_mask`."""
-        table = self.table
-        if self.scene.resampled:
-            least = 1 if self.object_set is None else self.object_set.number_range[0]
-            inputs = [self.scene.world_mask, self.seed, self.episode, self._ends, least, self.slots, self._wanted]
-            self.launch(kernels.draw_objects, inputs, [self._choice, table.kind])
-        inputs = [self.scene.world_mask, self.seed, table.kind, table.low, table.high, table.log]
-        self.launch(kernels.draw_parameters, inputs, [self.episode, table.values])
-
-    def _start(self) -> None:
-        """Set those worlds up from their parameters."""
+    def restart(self, mask: wp.array, options: dict[str, NDArray[np.float32]] | None = None) -> None:
+        """Start new episodes in the worlds of the mask; capturable without options."""
         scene = self.scene
-        mask = scene.world_mask
-        if scene.resampled:
-            self.use_objects()
-        self.apply_materials()
+        wp.copy(scene.world_mask, mask)
+        if options:
+            self.table.draw_with(scene.world_mask, options)
+        else:
+            self.table.draw(scene.world_mask)
+        if scene.occupancy.resampled:
+            scene.use_objects()
+        self.materials.apply(scene.world_mask)
         self.place()
         scene.reset_worlds()
         for camera in scene.cameras.values():
-            camera.randomize(mask)
-        self.launch(kernels.clear_worlds, [mask], [self._episode, self.result])
-        self.handling.forget(mask)
+            camera.randomize(scene.world_mask)
+        self.episodes.clear(scene.world_mask, self.result)
+        self.handling.forget(scene.world_mask)
         self.clear()
-
-    def use_objects(self) -> None:
-        """Let the worlds in `scene.world_mask` have the objects that `object_index` says, with what is theirs."""
-        self.scene.use_objects()
-        for table, array, every_slot in self._rows:
-            self.scene.copy_rows(table, array, every_slot=every_slot)
-
-    def apply_materials(self) -> None:
-        """Give the bodies of the worlds in `scene.world_mask` the materials and sizes of their parameters."""
-        values = self._material
-        inputs = [self.state, self._material_columns, self._own_materials, self._choice, self.slots]
-        self.launch(kernels.spread_materials, inputs, [values], values.shape[1])
-        wp.copy(self._solver_mask, self.scene.world_mask, count=self.world_count)
-        set_parameters(self.scene.solver, self._solver_mask, **self.materials)
 
     def write_observation(self) -> None:
         """Write the observation and the metrics of all worlds."""
-        columns = self.layout.columns_in(kernels.Columns)
-        self.launch(kernels.observe, [self.state, self._arm, columns], [self.observation])
-        if self.object_set is not None and self.config.objects_one_hot:
-            count = self.object_set.count
-            inputs = [self._choice, self.slots, count, self.column("object_one_hot")]
-            self.launch(kernels.observe_kind, inputs, [self.observation], (self.world_count, self.slots * count))
-        if self.slots > 1:
-            inputs = [self.state, self.column("other_offsets"), self.column("other_present")]
-            self.launch(kernels.observe_others, inputs, [self.observation], (self.world_count, self.slots - 1))
+        self.layout.write(self.state, self._arm)
         self.observe()
-        self.launch(kernels.bound_observation, [self._low, self._high], [self.observation, self.finite])
+        self.layout.bound()
 
-    def draw_pictures(self) -> None:
-        """Draw the picture of a pixel observation."""
-        if self.obs_type != "state":
-            edge = self.config.image_size
-            self.scene.draw(self.scene.cameras[edge, edge])
-
-    def draw_film(self) -> NDArray[np.uint8]:
-        """Return the pictures of the film cameras side by side, uint8 (world_count, edge, cameras * edge, 3)."""
-        scene, film = self.scene, self.scene.film
-        if film is not None:
-            time = self.elapsed.numpy() / self.config.scene.control_hz
-            film.aim(film.cameras[0].name, self._follow.matrices(self.in_focus(), time))
-        pictures = scene.draw_film().numpy()
-        cameras = pictures.reshape(-1, self.world_count, *pictures.shape[1:])
-        return np.concatenate(list(cameras), axis=2)
-
-    def forget_film(self, mask: NDArray[np.bool_]) -> None:
-        """Let the following camera jump to its place in the masked worlds, shape (world_count,)."""
-        self._follow.forget(mask)
-
-    def in_focus(self) -> NDArray[np.float64]:
-        """Return balls (x, y, z, radius) [m] that the following camera shows, shape (world_count, K, 4).
-
-        They are object 0, the hand, and the goal if a marker shows it.
-        """
-        scene = self.scene
-        scale = self.table.values.numpy()[:, self.table.column("scale")]
-        radius = np.array([thing.radius for thing in scene.members])[scene.member] * scale
-        balls = [(scene.object_position.numpy()[:, 0], radius), (scene.controller.tool_pose.numpy()[:, :3], HAND)]
-        if scene.marker is not None:
-            balls.append((scene.marker_place.numpy()[:, :3], MARKER))
-        return np.stack([np.column_stack([x, np.broadcast_to(r, len(x))]) for x, r in balls], axis=1)
-
-    # -- the step -----------------------------------------------------------------------------------------------------
+    def judge(self, fresh: wp.array) -> None:
+        """Observe and judge the step; worlds of the mask only started."""
+        self.write_observation()
+        self.episodes.failure.zero_()
+        self.episodes.any_done.zero_()
+        self.evaluate()
+        self.handling.judge(fresh, self.state, self.result)
+        self._finish(fresh)
 
     def step(self) -> None:
         """Advance all worlds by one control step with the actions in `scene.actions`."""
@@ -707,88 +424,91 @@ class Task:
 
     def _step(self) -> None:
         """Simulate, judge, start the episodes that are due, observe."""
-        scene = self.scene
+        scene, episodes = self.scene, self.episodes
         self.before_step()
         if self.autoreset_mode == AutoresetMode.NEXT_STEP:
-            wp.copy(self._fresh, self.done)
+            wp.copy(episodes.fresh, episodes.done)
             scene.control_step()
-            self.restart(self._fresh)
-            self.write_observation()
-            self.finish(self._fresh)
+            self.restart(episodes.fresh)
+            self.judge(episodes.fresh)
             self.clear()  # what `evaluate` counted in worlds that only started
         else:
             scene.control_step()
-            self.write_observation()
-            self.finish(self.never)
+            self.judge(episodes.never)
             if self.autoreset_mode == AutoresetMode.SAME_STEP:
-                if self.images:
-                    wp.capture_if(self.any_done, on_true=self._keep_pictures)
+                if self.pictures.images:
+                    wp.capture_if(episodes.any_done, on_true=self.pictures.keep_last)
                 for name, now in self.outcome.items():
                     wp.copy(self.final_outcome[name], now)
-                wp.copy(self._fresh, self.done)
-                self.restart(self._fresh)
+                wp.copy(episodes.fresh, episodes.done)
+                self.restart(episodes.fresh)
                 self.write_observation()
-        self.draw_pictures()
+        self.pictures.draw()
 
-    def _launches(self) -> None:
-        """Launch what a step launches beside the scene's, whose kernels the scene began to compile itself."""
-        self.before_step()
-        self.handling.watch(1)
-        self.write_observation()
-        self.finish(self.never)
-        self.clear()
 
-    def restart(self, mask: wp.array) -> None:
-        """Start new episodes in the worlds of the mask."""
-        wp.copy(self.scene.world_mask, mask)
-        self._draw()
-        self._start()
+def _layout(task: Task) -> ObservationTable:
+    """Return the observation of a task, laid out in its segments."""
+    held, given = task.scene.occupancy, task.config.object_set
+    code = one_hot_part(given.count, held.slots) if given is not None and task.config.objects_one_hot else ()
+    agent = (*proprioception(task.scene.controller.joint_count), *task.goal_segments())
+    seen = (*object_part(task.point_count), *task.object_segments(), *others_part(held.slots - 1), *code)
+    return ObservationTable(agent, seen, task.world_count, task.device)
 
-    def finish(self, fresh: wp.array) -> None:
-        """Judge the step."""
-        scene = self.scene
-        self.failure.zero_()
-        self.any_done.zero_()
-        self.handling.watch_grip(fresh, self.state)
-        self.evaluate()
-        self.handling.judge(self.result)
-        status, lowest = scene.solver.status, self._lowest
-        not_finite = bits.WORLD_NOT_FINITE | bits.WORLD_RIGID_NOT_FINITE
-        sparse = int(self.config.reward_mode == "sparse" and not self.config.terms_follow_mode)
-        inputs = [fresh, self.limit, sparse, not_finite, status, self.finite, self.state, lowest]
-        self.launch(kernels.finish_step, inputs, [self.result, self._episode])
 
-    def _keep_pictures(self) -> None:
-        """Draw the last picture of the episodes that end."""
-        self.draw_pictures()
-        for name, image in self.images.items():
-            wp.copy(self.final_images[name], image)
+def plan_of(task: Task, kernel: Any) -> Any:
+    """Return the second argument of a task's kernel, its fields found by their names.
 
-    # -- spaces -------------------------------------------------------------------------------------------------------
+    Raises:
+        ConfigError: If a field is nothing that the task has.
+    """
+    columns = {f"drawn_{name}": task.table.column(name) for name in task.table.parameters}
+    columns |= {f"column_{name}": task.layout.column(name) for name in task.segments}
+    sources = (task, task.config, task.config.scene.control, task.scene.soft)
+    try:
+        return filled(kernel.adj.args[1].type, *sources, **columns)
+    except AttributeError as error:
+        what = f"{type(task).__name__}: the plan of its kernels has a field {error.name!r}, which nothing has"
+        raise ConfigError(what, hint="name it as `Task.step_kernels` says, or set it in `build`") from error
 
-    @property
-    def action_space(self) -> gym.spaces.Box:
-        """Actions of one world, in [-1, 1]."""
-        return gym.spaces.Box(-1.0, 1.0, (self.scene.controller.action_size,), np.float32)
 
-    def state_keys(self) -> dict[str, slice]:
-        """Return the columns of each key of a state observation that is a dict; empty for one that is a vector."""
-        return {}
+def _check_set(task: type[Task], config: TaskConfig) -> None:
+    """Refuse a set of objects that a task cannot have.
 
-    def observation_space(self) -> gym.Space:
-        """Return the space of one world's observation; every bound is finite."""
-        if self.obs_type == "state":
-            keys = self.state_keys()
-            if keys:
-                return gym.spaces.Dict({name: self.layout.space(columns) for name, columns in keys.items()})
-            return self.layout.space(slice(0, len(self.low)))
-        edge = self.config.image_size
-        spaces: dict[str, gym.Space] = {"pixels": gym.spaces.Box(0, 255, (edge, edge, 3), np.uint8)}
-        if "depth" in self.images:
-            spaces["depth"] = gym.spaces.Box(0.0, 10.0, (edge, edge), np.float32)
-        if "segmentation" in self.images:
-            count = len(self.scene.cameras[edge, edge].labels)
-            spaces["segmentation"] = gym.spaces.Box(-1, count, (edge, edge), np.int32)
-        if self.obs_type == "pixels_agent_pos":
-            spaces["agent_pos"] = self.layout.space(slice(0, self.agent_size))
-        return spaces["pixels"] if list(spaces) == ["pixels"] else gym.spaces.Dict(spaces)
+    Raises:
+        ConfigError: If it cannot.
+    """
+    given = config.object_set
+    if given is None:
+        return
+    if not task.takes_sets:
+        raise ConfigError(
+            f"{task.__name__} cannot have another object in every world, objects is a set of {given.count}",
+            hint="give config.scene.object one object; a task of yours may set takes_sets",
+        )
+    slots = given.number_range[1]
+    if slots > 1 and not task.takes_several:
+        raise ConfigError(
+            f"{task.__name__} has one object per world, objects.per_world asks for {slots}",
+            hint="leave per_world out, or take LiftSoft, PushSoft or PlaceInBin",
+        )
+
+
+def _check_grasps(held: Occupancy, jaw: ParallelJaw) -> None:
+    """Refuse objects of a set that the gripper is to take and cannot.
+
+    Raises:
+        GraspError: If there is one; it names the object.
+    """
+    for name, thing, material in zip(held.names, held.choices, held.materials, strict=True):
+        friction = max(math.sqrt(material.friction * jaw.friction), 1.0e-3)
+        try:
+            rest_grasps(thing.body, jaw, friction=friction)
+        except GraspError as error:
+            hint = "give it another size, or leave it out of the set"
+            raise GraspError(f"{name} does not fit the gripper: {error.message}", hint=hint) from error
+
+
+def _kept(config: TaskConfig, material: Material) -> dict[str, float]:
+    """Return the properties of a material that are not drawn."""
+    names = [name for name in Materials.NAMES if name != "scale"] if config.object_set is not None else []
+    return {name: getattr(material, name) for name in names if getattr(config, f"{name}_range") is None}

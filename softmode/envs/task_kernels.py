@@ -4,14 +4,17 @@ from typing import Any
 
 import warp as wp
 
-from softmode.envs.end_reason import EndReason
-from softmode.envs.reward_kernels import StepResult, WorldState, is_there, surface_point, tool_position, write
+from softmode.envs.reward_kernels import (
+    EndReason,
+    StepResult,
+    WorldState,
+    is_there,
+    surface_point,
+    tool_position,
+    write,
+)
 
 wp.set_module_options({"enable_backward": False})
-
-
-UNASKED = wp.constant(-2)
-"""In the place of an object that a reset is to draw."""
 
 
 @wp.struct
@@ -43,6 +46,8 @@ class Columns:
     object_velocity: int
     object_offset: int
     object_points: int
+    arm: int  # where proprioception stands again, -1 for nowhere
+    arm_size: int
 
 
 @wp.struct
@@ -56,7 +61,7 @@ class Placement:
     shift: wp.array[float]  # from the unscaled object's centre to what lies at the position, along the yaw [m]
     height: wp.array2d[float]  # of the unscaled object's centre [m], (world_count, objects)
     gap: float  # [m]
-    object_index: int
+    index: int  # which object of a world
 
 
 @wp.struct
@@ -89,7 +94,7 @@ class Episode:
 def draw_parameters(
     world_mask: wp.array[wp.bool],
     seed: wp.array[int],
-    kind: wp.array[int],  # row of the bounds
+    row: wp.array[int],  # of the bounds
     low: wp.array2d[float],
     high: wp.array2d[float],
     logarithmic: wp.array[wp.bool],
@@ -107,46 +112,12 @@ def draw_parameters(
     for p in range(columns):
         random = wp.rand_init(seed[w], episode[w] * columns + p)
         u = wp.randf(random)
-        a = low[kind[w], p]
-        b = high[kind[w], p]
+        a = low[row[w], p]
+        b = high[row[w], p]
         value = a + u * (b - a)
         if logarithmic[p]:
             value = a * wp.exp(u * wp.log(b / a))
         parameters[w, p] = wp.clamp(value, a, b)
-
-
-@wp.kernel
-def draw_objects(
-    world_mask: wp.array[wp.bool],
-    seed: wp.array[int],
-    episode: wp.array[int],  # before it is counted
-    ends: wp.array[float],  # (objects,) where the share of each ends in [0, 1]
-    least: int,  # objects that a world has
-    slots: int,  # most of them
-    wanted: wp.array[int],  # (world_count * slots,) the objects that were asked for, -1 for none; UNASKED to draw
-    # Out:
-    object_out: wp.array[int],  # (world_count * slots,), -1 for none
-    kind_out: wp.array[int],  # (world_count,), the first
-):
-    """Draw the objects of an episode by the weights; parameters, whose offsets are not negative, draw from others."""
-    w = wp.tid()
-    if not world_mask[w]:
-        return
-    random = wp.rand_init(seed[w], -2 - episode[w])
-    number = slots
-    for slot in range(slots):
-        chosen = wanted[w * slots + slot]
-        if chosen == UNASKED:
-            u = wp.randf(random)
-            chosen = int(0)
-            while chosen < ends.shape[0] - 1 and u >= ends[chosen]:
-                chosen += 1
-            if slot == 0 and least < slots:
-                number = wp.min(least + int(float(slots + 1 - least) * wp.randf(random)), slots)
-            if slot >= number:
-                chosen = -1
-        object_out[w * slots + slot] = chosen
-    kind_out[w] = object_out[w * slots]
 
 
 @wp.kernel
@@ -166,8 +137,8 @@ def place_object(
     yaw = place.turn + state.parameters[w, place.yaw]
     x = state.parameters[w, place.position] - scale * place.shift[w] * wp.cos(yaw)
     y = state.parameters[w, place.position + 1] - scale * place.shift[w] * wp.sin(yaw)
-    z = place.height[w, place.object_index] * scale + place.gap
-    i = w * state.stride + place.object_index
+    z = place.height[w, place.index] * scale + place.gap
+    i = w * state.stride + place.index
     position_out[i] = wp.vec3d(wp.float64(x), wp.float64(y), wp.float64(z))
     yaw_out[i] = wp.float64(yaw)
 
@@ -199,9 +170,10 @@ def place_beside(
 
 @wp.kernel
 def spread_materials(
-    state: WorldState,
+    parameters: wp.array2d[float],
+    stride: int,  # soft bodies of a world
     columns: wp.array[int],
-    kept: wp.array2d[float],  # (members, columns) what is the object's own; no number where it is drawn
+    kept: wp.array2d[float],  # (choices, columns) what is the object's own; no number where it is drawn
     choice: wp.array[int],  # (world_count * slots,)
     slots: int,
     # Out, (columns, instance_count):
@@ -210,7 +182,7 @@ def spread_materials(
     """Give all soft objects of a world the drawn material and scale; beside the first, an object of a set keeps its."""
     i = wp.tid()
     for m in range(values.shape[0]):
-        value = state.parameters[i // state.stride, columns[m]]
+        value = parameters[i // stride, columns[m]]
         if slots > 1 and i % slots > 0:
             if choice[i] >= 0 and wp.isfinite(kept[choice[i], m]):
                 value = kept[choice[i], m]
@@ -228,7 +200,8 @@ def observe(
     """Write what every observation has.
 
     Proprioception: tool, heading, opening, finger forces, joints, and how far the command leads. Object 0: centre,
-    velocity, centre relative to the tool, and surface points relative to the centre.
+    velocity, centre relative to the tool, and surface points relative to the centre. Of tasks with goals proprioception
+    stands behind that again, so that what does not depend on the goal is one range.
     """
     w = wp.tid()
     p = tool_position(state, w)
@@ -255,6 +228,9 @@ def observe(
     write(observation, w, column.object_offset, x - p)
     for i in range(state.points.shape[1]):
         write(observation, w, column.object_points + 3 * i, surface_point(state, w, i) - x)
+    if column.arm >= 0:
+        for k in range(column.arm_size):
+            observation[w, column.arm + k] = observation[w, column.tool_position + k]
 
 
 @wp.kernel
@@ -276,8 +252,8 @@ def observe_others(
 
 
 @wp.kernel
-def observe_kind(
-    kind: wp.array[int],  # (world_count * slots,) objects of the set that each world has
+def observe_choice(
+    choice: wp.array[int],  # (world_count * slots,) objects of the set that each world has
     slots: int,
     count: int,  # objects of the set
     column: int,
@@ -286,7 +262,7 @@ def observe_kind(
 ):
     """Write for each slot 1 for the object of the set that is there, and 0 for the others."""
     w, k = wp.tid()
-    observation[w, column + k] = wp.where(kind[w * slots + k / count] == k % count, 1.0, 0.0)
+    observation[w, column + k] = wp.where(choice[w * slots + k / count] == k % count, 1.0, 0.0)
 
 
 @wp.kernel

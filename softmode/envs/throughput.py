@@ -14,7 +14,6 @@ import warp as wp
 from softmode.envs.arguments import checked_device
 from softmode.envs.reward_kernels import TOUCH_FORCE
 from softmode.envs.soft_vector_env import SoftVectorEnv
-from softmode.envs.task import Task
 from softmode.errors import ConfigError
 from softmode.scenes.capture import capture_graph
 
@@ -136,7 +135,7 @@ def report_throughput(
         flush=True,
     )
     if stages and options.get("processes", 1) == 1:
-        print("  " + ", ".join(f"{part} {spent:.2f} ms" for part, spent in stage_times(env.task).items()), flush=True)
+        print("  " + ", ".join(f"{part} {spent:.2f} ms" for part, spent in stage_times(env).items()), flush=True)
     env.close()
     return result
 
@@ -179,26 +178,21 @@ class _Source:
         return actions.clip(-1.0, 1.0)
 
 
-def stage_times(task: Task, repeats: int = 20) -> dict[str, float]:
+def stage_times(env: SoftVectorEnv, repeats: int = 20) -> dict[str, float]:
     """Return the median time of parts of a control step [ms], each captured as a graph of its own.
 
     Args:
-        task: The task; its worlds go on from where they are.
+        env: The environment, whose worlds live in this process and go on from where they are.
         repeats: Replays per part.
     """
-    scene = task.scene
-
-    def judging() -> None:
-        task.write_observation()
-        task.finish(task.never)
-
+    task = env.task
     parts: dict[str, Callable[[], None]] = {
-        "physics": scene.control_step,
-        "observe and judge": judging,
-        "masked reset": lambda: task.restart(task.never),
+        "physics": task.scene.control_step,
+        "observe and judge": lambda: task.judge(task.episodes.never),
+        "masked reset": lambda: task.restart(task.episodes.never),
     }
-    if task.images:
-        parts["camera"] = task.draw_pictures
+    if task.pictures.images:
+        parts["camera"] = task.pictures.draw
     graphs = {"whole step": task.graph}
     graphs |= {name: capture_graph(part, task.device) for name, part in parts.items()}
     spent: dict[str, list[float]] = {name: [] for name in graphs}

@@ -11,14 +11,16 @@ import multiprocessing
 import os
 import threading
 from multiprocessing.connection import Connection
-from typing import Any
+from typing import Any, cast
 
+import gymnasium as gym
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
 from softmode.envs.env_state import set_worlds_state, worlds_state
-from softmode.envs.results import host_view, info_arrays, observation_arrays, write
+from softmode.envs.handling import HANDLED
+from softmode.envs.results import Tree
 from softmode.envs.task import Task
 from softmode.errors import SoftmodeError, WorkerError
 from softmode.pause import collector_paused
@@ -42,10 +44,9 @@ class LocalWorlds:
             self.task = task_class(**arguments)
         self._result: dict[str, Any] | None = None
         self._actions = host_view(self.task.scene.actions)
-        self.parameters = self.task.reset_options
+        self.parameters = self.task.table.options
         self.segments = {name: columns for name, (columns, _) in self.task.segments.items()}
-        self.action_space = self.task.action_space
-        self.observation_space = self.task.observation_space()
+        self.action_space, self.observation_space = spaces_of(self.task)
 
     def connect(self) -> None:
         """Do nothing: the task is built."""
@@ -63,10 +64,11 @@ class LocalWorlds:
     def set_state(
         self, owner: dict[str, str], arrays: dict[str, NDArray[Any]], mask: NDArray[np.bool_], begin: bool
     ) -> None:
-        """Give the masked worlds a state; `begin` lets episodes begin there, see :meth:`Task.begin`."""
+        """Give the masked worlds a state; `begin` lets episodes begin there, see :meth:`Episodes.begin`."""
         set_worlds_state(self.task, owner, arrays, mask)
         if begin:
-            self.task.begin(mask)
+            self.task.episodes.begin(mask)
+            self.task.handling.forget(self.task.scene.world_mask)
 
     def step(self, actions: NDArray[np.float32] | None) -> None:
         """Advance all worlds; None takes the actions that are on the device already."""
@@ -82,9 +84,9 @@ class LocalWorlds:
         made = {
             "observation": observation_arrays(task),
             "state": task.observation,
-            "reward": task.reward,
-            "terminated": task.terminated,
-            "truncated": task.truncated,
+            "reward": task.episodes.reward,
+            "terminated": task.episodes.terminated,
+            "truncated": task.episodes.truncated,
             "info": info_arrays(task),
         }
         self._result = result = map_tree(host_view, made)
@@ -96,7 +98,7 @@ class LocalWorlds:
 
     def render(self) -> NDArray[np.uint8]:
         """Return a frame per world."""
-        return self.task.draw_film()
+        return film_of(self.task)
 
     def close(self) -> None:
         """Do nothing."""
@@ -260,3 +262,75 @@ def _portable(error: Exception) -> Exception:
 def _on_host(value: object) -> object:
     """Return a Warp array as a NumPy array, and anything else as it is."""
     return value.numpy() if isinstance(value, wp.array) else value
+
+
+def observation_arrays(task: Task, *, final: bool = False) -> Tree:
+    """Return the observation of all worlds in the structure of its space; `final`: before the reset."""
+    vector = (task.final_outcome if final else task.outcome)["observation"]
+    if task.obs_type == "state":
+        keys = task.layout.keys
+        return {name: columns_of(vector, columns) for name, columns in keys.items()} if keys else vector
+    images: dict[str, Tree] = dict(task.pictures.final_images if final else task.pictures.images)
+    if task.obs_type == "pixels_agent_pos":
+        images["agent_pos"] = columns_of(vector, slice(task.layout.agent_size))
+    return images["pixels"] if list(images) == ["pixels"] else images
+
+
+def spaces_of(task: Task) -> tuple[gym.spaces.Box, gym.Space]:
+    """Return the spaces of one world's actions, in [-1, 1], and of its observation, with finite bounds."""
+    actions = gym.spaces.Box(-1.0, 1.0, (task.scene.controller.action_size,), np.float32)
+    layout = task.layout
+    if task.obs_type == "state":
+        keys: dict[str, gym.Space] = {name: layout.space(columns) for name, columns in layout.keys.items()}
+        return actions, gym.spaces.Dict(keys) if keys else layout.space(slice(0, len(layout.low)))
+    spaces = task.pictures.spaces()
+    if task.obs_type == "pixels_agent_pos":
+        spaces["agent_pos"] = layout.space(slice(0, layout.agent_size))
+    return actions, spaces["pixels"] if list(spaces) == ["pixels"] else gym.spaces.Dict(spaces)
+
+
+def film_of(task: Task) -> NDArray[np.uint8]:
+    """Return a frame per world: the pictures of the film cameras side by side."""
+    return task.film.draw(task)
+
+
+def info_arrays(task: Task, *, final: bool = False) -> dict[str, Tree]:
+    """Return the infos of all worlds; with `final`, those of the episodes that ended in this step."""
+    outcome = task.final_outcome if final else task.outcome
+    success, safe, handled, metrics, parameters, vector, status, index = outcome.values()
+    which = {} if task.config.object_set is None else {"object": index}
+    return {
+        **which,
+        "is_success": success,
+        "is_safe_success": safe,
+        "success": success,
+        **{name: columns_of(handled, k) for k, name in enumerate(HANDLED)},
+        "reward_terms": {name: columns_of(task.terms, k) for k, name in enumerate(task.term_names)},
+        **{name: columns_of(metrics, k) for k, name in enumerate(task.metric_names)},
+        "parameters": {
+            name: columns_of(parameters, columns.start if columns.stop - columns.start == 1 else columns)
+            for name, columns in ((name, task.table.columns(name)) for name in task.table.parameters)
+        },
+        "finger_force": columns_of(vector, task.segments["finger_force"][0]),
+        "solver_status": status,
+        "end_reason": task.episodes.end,
+    }
+
+
+def columns_of(array: wp.array, columns: int | slice) -> wp.array:
+    """Return a view of one column, shape (world_count,), or of several."""
+    return cast(wp.array, array[:, columns])
+
+
+def host_view(array: wp.array) -> wp.array | np.ndarray:
+    """Return an array on CPU as a NumPy array of the same memory, and one on another device as it is."""
+    device: Any = array.device
+    return array.numpy() if device.is_cpu else array
+
+
+def write(values: np.ndarray, out: wp.array | np.ndarray) -> None:
+    """Write numbers of the host to what `host_view` returned."""
+    if isinstance(out, np.ndarray):
+        out[:] = values
+    else:
+        out.assign(values)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import types
 import typing
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -163,11 +162,6 @@ def _field_of(value: Any, hint: Any, before: Any) -> Any:
             raise ConfigError(f"{value!r} is no {kinds[0].__name__}", hint="give its fields by name")
         if all(kind is tuple for kind in kinds) and not isinstance(value, list | tuple):
             raise ConfigError(f"{value!r} is no list", hint="give one value after the other")
-    if isinstance(value, dict) and isinstance(before, Mapping):
-        unknown = sorted(set(value) - set(before))
-        if unknown:
-            raise ConfigError(f"there is no {unknown[0]!r} to change", hint=f"use one of {', '.join(before)}")
-        return {**before, **{name: config_of(type(before[name]), part, before[name]) for name, part in value.items()}}
     if isinstance(value, dict):
         kinds = [kind for kind in (hint, *arguments) if dataclasses.is_dataclass(kind)]
         if kinds:
@@ -184,9 +178,6 @@ def _value_of(value: Any, before: Any, name: str) -> Any:
     """Return the value of a field as JSON holds it."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return values_of(value, before if type(before) is type(value) else None)
-    if isinstance(value, Mapping) and isinstance(before, Mapping) and list(value) == list(before):
-        changed = {part: one for part, one in value.items() if one != before[part]}
-        return {part: _value_of(one, before[part], f"{name}[{part!r}]") for part, one in changed.items()}
     if isinstance(value, list | tuple):
         return [_value_of(part, None, name) for part in value]
     if isinstance(value, Path):

@@ -20,49 +20,55 @@ DEFAULT_STEPS = 10_000_000
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class TrainOptions:
+class RunOptions:
+    """What a training run is asked for, in Python and on the command line alike."""
+
+    env: str
+    """Id of the environment, for example softmode/LiftSoft-v0, or module:id of your own."""
+    num_envs: int = 16
+    """Worlds of each rank: 16 on a CPU, 4096 on a GPU."""
+    device: str = "cpu"
+    """cpu, cuda:0, or cuda under torchrun."""
+    seed: int = 0
+    """Seed of networks, exploration and worlds."""
+    time_limit: float | None = None
+    """Seconds of training after which it ends, those before a resumption included."""
+    run_dir: Path | None = None
+    """Folder of the run, not there yet; runs/<Env>/<time>[_name] if omitted."""
+    name: str | None = None
+    """Suffix of the folder's name."""
+    resume: bool = False
+    """Go on with the run in the folder after it was ended or killed: with its worlds, seed and hyperparameters."""
+    init: Path | None = None
+    """Checkpoint of the same environment whose networks training starts from."""
+    teacher: Path | None = None
+    """Checkpoint of a policy on the state of the same environment, whose actions one from pixels is drawn to."""
+    nan_guard: bool = False
+    """Check every observation and reward; dump the last steps of worlds that are not finite, and stop."""
+    eval_episodes: int = 200
+    """Episodes of the evaluation at the end; none with 0."""
+    checkpoint_seconds: float = 30.0
+    """Seconds between two checkpoints."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TrainOptions(RunOptions):
     """What to train, how long, and where the run is kept.
 
     Raises:
         ConfigError: If an option lies outside its range.
     """
 
-    env: str
-    """Id of the environment, for example softmode/LiftSoft-v0, or module:id of your own."""
-    num_envs: int = 16
-    """Worlds of each rank."""
     processes: int = 1
     """Child processes that share the worlds of a rank, on a CPU; their steps are the same bits for any number."""
-    device: str = "cpu"
-    """cpu, cuda:0, or cuda under torchrun."""
-    seed: int = 0
-    """Seed of networks, exploration and worlds."""
     total_steps: int | None = None
     """Environment steps of all worlds together after which training ends; ten million if no limit is given."""
-    time_limit: float | None = None
-    """Seconds of training after which it ends, those before a resumption included."""
     env_options: dict[str, Any] = dataclasses.field(default_factory=dict)
     """Keyword arguments of the environment as JSON values, for example obs_type; config as a dict of its fields."""
     hyperparameters: Hyperparameters | None = None
     """The preset of the number of worlds if omitted."""
     overrides: dict[str, Any] = dataclasses.field(default_factory=dict)
     """Hyperparameters that differ from those."""
-    run_dir: Path | None = None
-    """Folder of the run; runs/<Env>/<time>[_name] if omitted."""
-    name: str | None = None
-    """Suffix of the folder's name."""
-    resume: bool = False
-    """Go on with the run in run_dir: its worlds, seed and hyperparameters are taken from there."""
-    init: Path | None = None
-    """Checkpoint of the same environment whose networks training starts from."""
-    teacher: Path | None = None
-    """Checkpoint of a policy on the state of the same environment, whose actions one from pixels is drawn to."""
-    nan_guard: bool = False
-    """Check every observation and reward, and dump the last steps of worlds that are not finite."""
-    eval_episodes: int = 200
-    """Episodes of the evaluation at the end; none with 0."""
-    checkpoint_seconds: float = 30.0
-    """Seconds between two checkpoints."""
     tensorboard: bool = True
     """Write scalars for TensorBoard where it is installed; progress.csv is always written."""
 

@@ -10,38 +10,25 @@ from typing import TYPE_CHECKING
 from softmode.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from softmode.mpm.grid import Grid
-    from softmode.mpm.losses import CoarseMassLoss, MassLoss, position_loss
-    from softmode.mpm.morphing import morph
-    from softmode.mpm.options import MpmOptions
-    from softmode.mpm.particles import ParticleBody, particles_from_body, particles_from_mesh, particles_from_shape
-    from softmode.mpm.planner import MORPH_MATERIAL, MorphOptions, MorphPlanner
-    from softmode.mpm.replaying import ReplayFrame, replay
-    from softmode.mpm.run import MorphRun
-    from softmode.mpm.shapes import GridShapes
-    from softmode.mpm.simulation import MpmSimulation, ParameterBars, ParticleState
-
-__all__ = [
-    "MORPH_MATERIAL",
-    "CoarseMassLoss",
-    "Grid",
-    "GridShapes",
-    "MassLoss",
-    "MorphOptions",
-    "MorphPlanner",
-    "MorphRun",
-    "MpmOptions",
-    "MpmSimulation",
-    "ParameterBars",
-    "ParticleBody",
-    "ParticleState",
-    "ReplayFrame",
-    "morph",
-    "particles_from_body",
-    "particles_from_mesh",
-    "particles_from_shape",
-    "position_loss",
-    "replay",
-]
+    from softmode.mpm.grid import Grid as Grid
+    from softmode.mpm.losses import MassLoss as MassLoss
+    from softmode.mpm.losses import position_loss as position_loss
+    from softmode.mpm.morphing import morph as morph
+    from softmode.mpm.options import MpmOptions as MpmOptions
+    from softmode.mpm.particles import ParticleBody as ParticleBody
+    from softmode.mpm.particles import particles_from_body as particles_from_body
+    from softmode.mpm.particles import particles_from_mesh as particles_from_mesh
+    from softmode.mpm.particles import particles_from_shape as particles_from_shape
+    from softmode.mpm.places import PlaceLoss as PlaceLoss
+    from softmode.mpm.planner import MORPH_MATERIAL as MORPH_MATERIAL
+    from softmode.mpm.planner import MorphOptions as MorphOptions
+    from softmode.mpm.planner import MorphPlanner as MorphPlanner
+    from softmode.mpm.replaying import ReplayFrame as ReplayFrame
+    from softmode.mpm.replaying import replay as replay
+    from softmode.mpm.run import MorphRun as MorphRun
+    from softmode.mpm.shapes import GridShapes as GridShapes
+    from softmode.mpm.simulation import MpmSimulation as MpmSimulation
+    from softmode.mpm.simulation import ParameterBars as ParameterBars
+    from softmode.mpm.simulation import ParticleState as ParticleState
 
 __getattr__, __dir__ = lazy_names(__name__)

@@ -60,3 +60,44 @@ def position_at_particles(
         r = x[world, p] - target[world % target.shape[0], p]
     wp.atomic_add(loss, world, wp.float64(0.5) * wp.float64(wp.length_sq(r)))
     bar[world, p] = r
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def stray_at_nodes(
+    grid_mass: wp.array4d[Any],
+    stray: wp.array3d[Any],
+    weights: wp.array[wp.float64],
+    loss: wp.array[wp.float64],
+    bar: wp.array4d[Any],
+    active: wp.array[int],
+):
+    """Add a weight times what a unit of mass costs at every node, and its derivative by m."""
+    world, i, j, k = wp.tid()
+    cost = stray.dtype(weights[1]) * stray[i, j, k]
+    if not moves(active, world) or cost == stray.dtype(0.0):
+        return
+    m = grid_mass[world, i, j, k]
+    if m > stray.dtype(0.0):
+        wp.atomic_add(loss, world, wp.float64(cost) * wp.float64(m))
+    bar[world, i, j, k] = bar[world, i, j, k] + cost
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def place_at_particles(
+    x: wp.array2d[Any],
+    volume: wp.array2d[Any],
+    place: wp.array2d[Any],
+    weights: wp.array[wp.float64],
+    loss: wp.array[wp.float64],
+    bar: wp.array2d[Any],
+    active: wp.array[int],
+):
+    """Add w V/2 |x - y|^2 of every particle, and write its derivative by x."""
+    world, p = wp.tid()
+    if not moves(active, world):
+        return
+    k = volume.dtype(weights[0]) * volume[world, p]
+    r = x[world, p] - place[world, p]
+    if weights[0] > wp.float64(0.0):
+        wp.atomic_add(loss, world, wp.float64(0.5) * wp.float64(k) * wp.float64(wp.length_sq(r)))
+    bar[world, p] = k * r

@@ -6,7 +6,6 @@ being thrown out for a small gain (Xu, Song, Levin, Hyde 2025, eqs. (5) to (7)).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Literal, get_args
 
 import numpy as np
@@ -16,9 +15,10 @@ from numpy.typing import ArrayLike
 from softmode.checks import require_choice, require_number
 from softmode.errors import ConfigError
 from softmode.mpm.adjoint_kernels import mass_to_grid_adjoint
-from softmode.mpm.grid import MARGIN, Grid
+from softmode.mpm.grid import Grid
 from softmode.mpm.loss_kernels import log_mass_at_nodes, mass_at_nodes, position_at_particles
 from softmode.mpm.particles import ParticleBody
+from softmode.mpm.places import PlaceLoss
 from softmode.mpm.simulation import MpmSimulation, ParameterBars, ParticleState, scatter_masses
 
 MassLossKind = Literal["log", "squared"]
@@ -152,13 +152,13 @@ class MassLoss:
         self.evaluate(simulation.grid_mass, loss, simulation.grid_mass_bar, simulation.active)
 
     def gradient(
-        self, simulation: MpmSimulation, coarse: Sequence[CoarseMassLoss] = ()
+        self, simulation: MpmSimulation, places: PlaceLoss | None = None
     ) -> tuple[ParticleState, ParameterBars]:
         """Carry the loss of :meth:`after` back to a simulation's start.
 
         Args:
             simulation: That of :meth:`after`.
-            coarse: Losses on coarser grids that were added to it.
+            places: What was added to it by :meth:`PlaceLoss.add`.
 
         Returns:
             What :meth:`MpmSimulation.backward` returns.
@@ -166,9 +166,9 @@ class MassLoss:
         bar, parameters = simulation.bars()
         bar.zero()
         parameters.mass.zero_()
+        if places is not None:
+            places.spread(bar.x)
         self.spread(simulation.last.x, simulation.mass, simulation.grid_mass_bar, bar.x, parameters.mass)
-        for level in coarse:
-            level.spread(simulation, bar.x, parameters.mass)
         return simulation.backward()
 
     def value_and_gradient(self, points: ArrayLike, masses: ArrayLike) -> tuple[float, np.ndarray, np.ndarray]:
@@ -241,76 +241,6 @@ class MassLoss:
         grid_mass = wp.zeros((x.shape[0], *self.grid.shape), dtype=self.dtype, device=self.device)
         self.scatter(x, mass, grid_mass)
         return grid_mass
-
-
-class CoarseMassLoss:
-    """The logarithmic loss on a coarser grid, added to that of a :class:`MassLoss`.
-
-    The logarithm is flat where nodes are full: particles within a hole that should open are hardly pushed. On a coarser
-    grid the hole is a node that is too heavy.
-    """
-
-    def __init__(self, fine: MassLoss, simulation: MpmSimulation, target: ParticleBody, *, factor: int) -> None:
-        """Put the target on a grid with cells ``factor`` times as wide; a node is compared with as much more mass.
-
-        Args:
-            fine: The loss that it is added to.
-            simulation: Whose particles are compared.
-            target: Particles that masses should come to.
-            factor: Width of its cells over the grid's; also the factor of the loss, while :attr:`weight` is 1.
-        """
-        scale = factor**3 * fine.mass_scale
-        self._factor, self._worlds = factor, simulation.world_count
-        grid = self._coarse(fine.grid)
-        self._loss = MassLoss(grid, target, mass_scale=scale, dtype=fine.dtype, device=fine.device)
-        self._allocate()
-        with wp.ScopedDevice(fine.device):
-            self._weight = wp.zeros(1, dtype=wp.float64)
-        self.weigh(1.0)
-
-    def _coarse(self, grid: Grid) -> Grid:
-        """Return the coarse grid over a fine one; its nodes do not depend on where that one begins."""
-        width, first = self._factor * grid.spacing, np.array(grid.first)
-        begin = first // self._factor
-        # One more than cells on a grid that begins with a coarse node: the shape is that of any place.
-        shape = -(-(np.array(grid.shape) - 1) // self._factor) + 2 * MARGIN + 2
-        origin = np.array(grid.origin) - MARGIN * width
-        return Grid(
-            shape=(int(shape[0]), int(shape[1]), int(shape[2])),
-            spacing=width,
-            origin=(float(origin[0]), float(origin[1]), float(origin[2])),
-            first=(int(begin[0]), int(begin[1]), int(begin[2])),
-        )
-
-    def _allocate(self) -> None:
-        """Make the arrays of the nodes."""
-        nodes, loss = (self._worlds, *self._loss.grid.shape), self._loss
-        self._mass, self._bar = (wp.zeros(nodes, dtype=loss.dtype, device=loss.device) for _ in range(2))
-
-    def place(self, fine: Grid, target: ParticleBody) -> None:
-        """Take another part of the fine grid's nodes, and a target, as :meth:`MassLoss.place`."""
-        grid = self._coarse(fine)
-        other = grid.shape != self._loss.grid.shape
-        self._loss.place(grid, target)
-        if other:
-            self._allocate()
-
-    def weigh(self, weight: float) -> None:
-        """Set the factor of the loss, beside that of its cells; graphs that were captured read it."""
-        self._weight.fill_(weight * self._factor)
-
-    def aim(self, target: ParticleBody) -> None:
-        """Take another target, in the same arrays."""
-        self._loss.aim(target)
-
-    def add(self, simulation: MpmSimulation, loss: wp.array) -> None:
-        """Add the loss after the last step of a simulation, and keep its derivative on the grid."""
-        self._loss.scatter(simulation.last.x, simulation.mass, self._mass, simulation.active)
-        self._loss.add_log(self._mass, self._weight, loss, self._bar, simulation.active)
-
-    def spread(self, simulation: MpmSimulation, x_bar: wp.array, mass_bar: wp.array) -> None:
-        """Add the derivatives by positions and masses, after :meth:`add`."""
-        self._loss.spread(simulation.last.x, simulation.mass, self._bar, x_bar, mass_bar)
 
 
 def position_loss(x: wp.array, mass: wp.array, target: wp.array, loss: wp.array, x_bar: wp.array) -> None:

@@ -27,9 +27,10 @@ from softmode.deformables import Material
 from softmode.deformables.materials.material_kernels import MaterialModel
 from softmode.errors import AssetError, ConfigError, SolverDiverged
 from softmode.mpm.grid import Grid
-from softmode.mpm.losses import CoarseMassLoss, MassLoss, MassLossKind
+from softmode.mpm.losses import MassLoss, MassLossKind
 from softmode.mpm.options import MpmOptions
 from softmode.mpm.particles import ParticleBody
+from softmode.mpm.places import PlaceLoss, transported
 from softmode.mpm.planner_kernels import (
     Record,
     Search,
@@ -52,8 +53,6 @@ Array = NDArray[np.float64]
 
 UNEQUAL_MASS = 0.3
 """Part by which masses may differ before it is told."""
-COARSE = (2, 4)
-"""Cells of the coarser grids over those of the particles'."""
 NORM_THREADS = 512
 """Threads of a GPU that sum up the gradient of a world."""
 KEPT_BYTES = 1.0e8
@@ -93,14 +92,15 @@ class MorphOptions:
     """A pass ends when the gradient is smaller than this part of the pass's first."""
     loss: MassLossKind = "log"
     """Distance of masses on the grid: that of logarithms, or "squared" for comparison, which throws particles out. It
-    is compared on the fine grid alone."""
+    has no places."""
     mass_scale: float = 1.0
     """Mass scale of the logarithmic loss [kg]."""
     target_accuracy: float | None = None
     """Leave a target when 1 - loss / first loss exceeds this, 0 < accuracy < 1; None goes on to the last frame."""
-    coarse: float = 0.7
-    """First part of the segments to a target, 0..1, whose loss also compares masses on grids with two and four times
-    as wide cells, where particles in a hole that should open feel a push."""
+    places: float = 0.4
+    """First part of the segments to a target, 0..1, in which particles are also drawn to places of their own in it,
+    with a weight that falls to 0. What lies over a cell away from the target is drawn to it until the body settles.
+    With 0 neither is done, and what lies in a hole that should open is pressed out and left."""
     settling: float = 0.15
     """Last part of the segments to the last target, 0..1. Each of them begins, and the run ends, with half of the
     velocity and without stress: the shape at hand becomes the rest shape (F = I). Else the body moves on, and what
@@ -124,7 +124,7 @@ class MorphOptions:
         require_choice("loss", self.loss, get_args(MassLossKind))
         require_choice("grid", self.grid, get_args(GridMotion))
         require_number("mass_scale", self.mass_scale, above=0.0, unit="kg")
-        require_number("coarse", self.coarse, at_least=0.0, at_most=1.0)
+        require_number("places", self.places, at_least=0.0, at_most=1.0)
         require_number("settling", self.settling, at_least=0.0, at_most=1.0)
         if self.target_accuracy is not None:
             require_number("target_accuracy", self.target_accuracy, above=0.0, below=1.0)
@@ -287,8 +287,7 @@ class MorphPlanner:
             grid.require(goal.positions, "target")
         real, _, mat = TYPES[mpm.precision]
         self.loss = MassLoss(grid, self.targets[0], kind=o.loss, mass_scale=o.mass_scale, dtype=real, device=s.device)
-        factors = COARSE if o.coarse and o.loss == "log" else ()
-        self._coarse = [CoarseMassLoss(self.loss, s, self.targets[0], factor=factor) for factor in factors]
+        self._places = PlaceLoss(s) if o.places and o.loss == "log" else None
         self.notes = tuple(
             f"world {world}: masses differ, {body.mass:.4g} kg become {goal.mass:.4g} kg (ratio {ratio:.3g}), so the "
             "loss cannot vanish"
@@ -418,15 +417,18 @@ class MorphPlanner:
         self._kept.flush()
         if s.place_grid(grid):
             self._graph = None
-        for loss in (self.loss, *self._coarse):
-            loss.place(grid, self.targets[target])
+        self.loss.place(grid, self.targets[target])
+        if self._places is not None:
+            self._places.place(grid, self.targets[target])
 
     def _aim(self, target: int) -> None:
         """Turn to a target."""
         if self.options.grid == "follow":
             self._follow(target)
-        for loss in (self.loss, *self._coarse):
-            loss.aim(self.targets[target])
+        self.loss.aim(self.targets[target])
+        if self._places is not None:
+            self._places.place(self.loss.grid, self.targets[target])
+            self._places.aim(self._find_places(target))
         log = self._log
         if len(log.first_losses) == target:
             self._find_loss_of(self.simulation.first)
@@ -436,6 +438,20 @@ class MorphPlanner:
         settles = self._settling(target)[1] > 0
         goal = self._goal(target) if settles else np.full(self.simulation.world_count, -np.inf)
         self._kept.record.goal.assign(goal)
+
+    def _find_places(self, target: int) -> Array:
+        """Return a place in the target for every particle, from where its turn came [m], (W, N, 3)."""
+        s, log = self.simulation, self._log
+        begun = log.ends[target - 1] if target else 0
+        resumed = log.segment_count > begun
+        x = wp.array(self._kept.positions[begun], dtype=s.first.x.dtype, device=s.device) if resumed else s.first.x
+        points, goal = x.numpy().astype(np.float64), self.targets[target]
+        grid = s.options.grid.reaching(points.reshape(-1, 3), goal.positions, room=0)
+        loss = MassLoss(grid, goal, dtype=self.loss.dtype, device=s.device)
+        mass = wp.zeros((s.world_count, *grid.shape), dtype=self.loss.dtype, device=s.device)
+        loss.scatter(x, s.mass, mass)
+        full = loss.target_mass.numpy()[0]
+        return np.stack([transported(x, m, full, grid) for x, m in zip(points, mass.numpy(), strict=True)])
 
     def _goal(self, target: int) -> Array:
         """Return the losses with which a target is reached, (W,)."""
@@ -452,13 +468,15 @@ class MorphPlanner:
         return begun + min([self.segments - settling, *reached]), settling
 
     def _set_up_segment(self, target: int) -> None:
-        """Tell the device what differs in the segment to come: coarse grids, and whether it settles for sure."""
+        """Tell the device what differs in the segment to come: weights, and whether it settles for sure."""
         log = self._log
         begun = log.ends[target - 1] if target else 0
-        for level in self._coarse:
-            level.weigh(float(log.segment_count - begun < int(self.options.coarse * self.segments)))
         first, settling = self._settling(target)
-        self._kept.record.settling.fill_(int(settling > 0 and log.segment_count + 1 >= first))
+        settles = settling > 0 and log.segment_count + 1 >= first
+        if self._places is not None:
+            done = (log.segment_count - begun) / self.segments
+            self._places.weigh(max(0.0, 1.0 - done / self.options.places), float(not settles))
+        self._kept.record.settling.fill_(int(settles))
 
     @property
     def fingerprint(self) -> str:
@@ -563,7 +581,7 @@ class MorphPlanner:
         """Take a gradient and step along it."""
         o, s = self.options, self.simulation
         self._per_world(begin_gradient, [self._search, o.step_length, o.iteration_count])
-        control_bar = self.loss.gradient(s, self._coarse)[1].control
+        control_bar = self.loss.gradient(s, self._places)[1].control
         threads = NORM_THREADS if s.device.is_cuda else 1
         self._per_layer(gradient_norm, [control_bar, self._search.norm, threads], threads)
         self._per_world(begin_search, [self._search, wp.float64(o.gradient_tolerance), o.iteration_count])
@@ -610,8 +628,8 @@ class MorphPlanner:
         s = self.simulation
         s.forward()
         self.loss.after(s, self._search.trial_loss)
-        for level in self._coarse:
-            level.add(s, self._search.trial_loss)
+        if self._places is not None:
+            self._places.add(self._search.trial_loss)
 
     def _per_world(self, kernel: Callable[..., object], inputs: list[object]) -> None:
         wp.launch(kernel, self.simulation.world_count, inputs=inputs, device=self.simulation.device)

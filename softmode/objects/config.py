@@ -13,9 +13,10 @@ from softmode.deformables.materials.material import Material
 from softmode.deformables.quadrature.surface_samples import SURFACE_COUNT
 from softmode.deformables.reduction.options import BuildOptions
 from softmode.errors import AssetError, ConfigError
+from softmode.objects.captures import bundled
 from softmode.objects.fingerprint import file_fingerprint, find_file
 from softmode.objects.paint import StifferColor
-from softmode.objects.parts import Part
+from softmode.objects.parts import Part, Rule
 from softmode.objects.shapes.presets import find_preset
 from softmode.objects.shapes.primitives import Color, Extents, find_axis
 from softmode.radiance.grid import RadianceGrid
@@ -68,7 +69,7 @@ class ObjectConfig:
     """Name of an object of the library, `PRESETS`: "sponge", "mug", ...; `load` gives it the preset's material."""
     splat: str | Path | Splats | None = None
     """Splat file (.ply, SOG v2, .spz, .splat, OpenUSD), or a point cloud (.npz, see `read_points`, or .ply); or splats
-    that have been read."""
+    that have been read; or the name of a bundled capture, "playbot"."""
     mesh: str | Path | ColoredMesh | None = None
     """Mesh file (.obj, .glb, .stl, ... whatever trimesh reads, OpenUSD), or a mesh that has been read. One that is not
     closed stands for what it encloses."""
@@ -95,8 +96,9 @@ class ObjectConfig:
     cuts an object off what it touched when it was captured."""
     part: Part = "thickest"
     """Which of the separate parts of a splat file is the object: the one with the largest least spread, so that neither
-    the ground it was captured on, wide but thin, nor loose small parts win; the one with the greatest height; the one
-    with most splats; or whatever there is."""
+    the ground it was captured on, wide but thin, nor loose small parts win, without the plinth, turntable or stem that
+    carries it; the one with the greatest height; the one with most splats; or whatever there is. Numbers, such as
+    (1, 2), take those candidates that `softmode splat show` draws."""
     resolution: int | None = None
     """Voxels along the longest edge of the grid in which a splat file is filled; None takes 64 to 384,
     as its thin parts need."""
@@ -132,9 +134,13 @@ class ObjectConfig:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
+        if isinstance(self.splat, str | Path):
+            object.__setattr__(self, "splat", bundled(self.splat) or self.splat)
         object.__setattr__(self, "stiffness", tuple(self.stiffness))
         object.__setattr__(self, "stiffness_colors", tuple(self.stiffness_colors))
         object.__setattr__(self, "density_colors", tuple(self.density_colors))
+        if isinstance(self.part, int | list):
+            object.__setattr__(self, "part", (self.part,) if isinstance(self.part, int) else tuple(self.part))
         if self.size is not None:
             hint = "give the longest edge in metres"
             require_number("size", self.size, at_least=1.0e-3, at_most=10.0, unit="m", hint=hint)
@@ -148,8 +154,8 @@ class ObjectConfig:
             require_number("resolution", self.resolution, at_least=16, at_most=512)
         if self.crop is not None and not all(a < b for a, b in zip(self.crop[:3], self.crop[3:], strict=True)):
             raise ConfigError(f"crop {self.crop} is empty", hint="give x0 y0 z0 x1 y1 z1 with every 0 below its 1")
-        for name, known in (("shape", Shape), ("up", UpAxis), ("part", Part), ("pose", Pose)):
-            if name != "up" or self.up is not None:
+        for name, known in (("shape", Shape), ("up", UpAxis), ("part", Rule), ("pose", Pose)):
+            if not ((name == "up" and self.up is None) or (name == "part" and self._numbers)):
                 require_choice(name, getattr(self, name), get_args(known))
         files = (self.preset, self.splat, self.mesh, self.radiance, self.body)
         if sum(file is not None for file in files) + (self.shape != "plush") > 1:
@@ -174,6 +180,11 @@ class ObjectConfig:
                 )
             if np.shape(self.colors) != (2, 3) or not all(0.0 <= x <= 1.0 for color in self.colors for x in color):
                 raise ConfigError(f"colors {self.colors} are not two colours", hint="give two of (r, g, b) in 0..1")
+
+    @property
+    def _numbers(self) -> bool:
+        """Whether `part` is numbers of candidates."""
+        return isinstance(self.part, tuple) and bool(self.part) and all(isinstance(k, int) for k in self.part)
 
     @property
     def kind(self) -> str:

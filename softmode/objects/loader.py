@@ -1,25 +1,33 @@
-"""`load`: whatever describes a soft object, as a soft object."""
+"""`load`: whatever describes a soft object, as a soft object, in one line of stages.
+
+`object_config` says of which kind a source is, :func:`softmode.objects.source.object_source` reads that kind by its
+table, `build_standing` integrates it, lays it down and reduces it, `dressed` gives the body its splats.
+"""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.body.regions import Region
 from softmode.deformables.materials.material import Material, warn_of_units
+from softmode.deformables.quadrature.quadrature_grid import Quadrature
 from softmode.deformables.reduction.cache import cached_body
+from softmode.objects.captures import bundled
 from softmode.objects.config import ObjectConfig
 from softmode.objects.object_file import file_kind, read_object, surface_cover
 from softmode.objects.pipeline import body_key, build_standing, dressed
 from softmode.objects.shapes.presets import PRESETS
 from softmode.objects.soft_object import SoftObject
-from softmode.objects.source import object_source
+from softmode.objects.source import ObjectSource, object_source
 from softmode.radiance.grid import RadianceGrid
 from softmode.splats.colored_mesh import ColoredMesh
 from softmode.splats.splats import Splats
+from softmode.stages import stage
 
 if TYPE_CHECKING:
     import trimesh
@@ -28,6 +36,8 @@ if TYPE_CHECKING:
     """What can be loaded beside a file."""
 
 Progress = Callable[[str, float], None] | bool | None
+_IN_MEMORY: dict[type, str] = {Splats: "splat", RadianceGrid: "radiance", ColoredMesh: "mesh"}
+"""Which option of a configuration takes what has been read."""
 
 
 def load(
@@ -40,9 +50,9 @@ def load(
     """Return a soft object: read or make its splats, build or recall its body.
 
     Args:
-        source: A configuration; the name of a preset, such as "mug"; a file of splats, of a point cloud, of a mesh, of
-            a radiance field or of a body, or an OpenUSD stage with any of these but a field; a body; splats, a field or
-            a mesh (also of trimesh) in memory; None for the built-in plush.
+        source: A configuration; the name of a preset, such as "mug", or of the capture "playbot"; a file of splats, of
+            a point cloud, of a mesh, of a radiance field or of a body, or an OpenUSD stage with any of these but a
+            field; a body; splats, a field or a mesh (also of trimesh) in memory; None for the built-in plush.
         material: What it is made of; None for what its file or preset says. The body is built for its Poisson's ratio,
             unless `BuildOptions` name one.
         progress: Passed to :func:`softmode.deformables.reduction.build_body.build_body`.
@@ -71,11 +81,52 @@ def load(
             contact_radius=config.contact_radius,
             config=config,
         )
-    parts = object_source(config)
-    material = material or config.material
-    made = config.for_material(material)
+    parts, material, made = _read(config, material)
     body = cached_body(body_key(made, parts), lambda: build_standing(made, parts, progress=progress)[0])
     return dressed(body, config, parts, material)
+
+
+def build_object(
+    source: Source | str | os.PathLike[str],
+    *,
+    regions: Sequence[Region] = (),
+    material: Material | None = None,
+    progress: Progress = None,
+    **options: Any,
+) -> tuple[SoftObject, Quadrature]:
+    """Build an object anew and not in the cache, as `load` does, with regions that a scene holds.
+
+    Regions and boxes are given in the coordinates of the standing object: metres, z up, its bounding box centred over
+    the origin and standing on z = 0. The body's `provenance` tells the kind of the asset and how much of it was left
+    out.
+
+    Args:
+        source: Which object, as for `load`; not a body.
+        regions: Parts that a scene holds, moves or grasps.
+        material: What the object is made of, as for `load`.
+        progress: As for `load`.
+        options: Fields of `ObjectConfig`, such as ``size=0.08``.
+
+    Returns:
+        The object, and the quadrature that it was built from, in the coordinates of the standing object.
+
+    Raises:
+        AssetError: If the file cannot be read or encloses no volume.
+        ConfigError: If the configuration names a body, or a box holds nothing.
+        BasisError: If the basis cannot be built, or a region holds too little.
+    """
+    config = object_config(source, **options)
+    parts, material, made = _read(config, material)
+    body, quadrature = build_standing(made, parts, regions=regions, progress=progress)
+    return dressed(body, config, parts, material), quadrature
+
+
+def _read(config: ObjectConfig, material: Material | None) -> tuple[ObjectSource, Material | None, ObjectConfig]:
+    """Return what an object is made of, its material, and the configuration of a body for that."""
+    with stage(f"reading {config.preset or (config.kind if config.file is None else config.file[1].name)}"):
+        parts = object_source(config)
+    material = material or config.material
+    return parts, material, config.for_material(material)
 
 
 def object_config(source: Source | str | os.PathLike[str] | None, **options: Any) -> ObjectConfig:
@@ -97,14 +148,13 @@ def object_config(source: Source | str | os.PathLike[str] | None, **options: Any
     if isinstance(source, str | os.PathLike):
         if os.fspath(source) in PRESETS:
             return ObjectConfig(preset=os.fspath(source), **options)
+        if bundled(source):
+            return ObjectConfig(splat=source, **options)
         kind = file_kind(source)
         return ObjectConfig(**{"splat" if kind == "points" else kind: Path(source)}, **options)
-    if isinstance(source, Splats):
-        return ObjectConfig(splat=source, **options)
-    if isinstance(source, RadianceGrid):
-        return ObjectConfig(radiance=source, **options)
-    if isinstance(source, ColoredMesh):
-        return ObjectConfig(mesh=source, **options)
+    for known, kind in _IN_MEMORY.items():
+        if isinstance(source, known):
+            return ObjectConfig(**{kind: source}, **options)
     import trimesh
 
     if isinstance(source, trimesh.Trimesh | trimesh.Scene):

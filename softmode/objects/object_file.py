@@ -16,6 +16,7 @@ from softmode.deformables.materials.material import Material
 from softmode.errors import AssetError
 from softmode.files import array_names, damage_errors
 from softmode.foreign import tokens
+from softmode.objects.captures import CAPTURES
 from softmode.objects.shapes.presets import PRESETS
 from softmode.objects.soft_object import SoftObject
 from softmode.radiance.formats import is_radiance
@@ -98,8 +99,9 @@ def file_kind(path: str | os.PathLike[str]) -> FileKind:
     with damage_errors(f"file {file}", hint="check the path"):
         exists = file.exists()
     if not exists:
-        like = difflib.get_close_matches(file.name, PRESETS, n=len(PRESETS), cutoff=0.5)
-        presets = ", ".join([*like, *(name for name in PRESETS if name not in like)])
+        names = (*PRESETS, *CAPTURES)
+        like = difflib.get_close_matches(file.name, names, n=len(names), cutoff=0.5)
+        presets = ", ".join([*like, *(name for name in names if name not in like)])
         named = len(file.parts) == 1 and not file.suffix
         hint = f"check the path, or name a preset: {presets}" if named else "check the path"
         raise AssetError(f"file {file}: no such file", hint=hint)

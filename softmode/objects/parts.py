@@ -7,12 +7,17 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 from scipy.spatial import KDTree
 
-from softmode.splats.components import split_components
-from softmode.splats.splats import Splats, rotations_from_quats
+from softmode.errors import ConfigError
+from softmode.objects.carrier_cut import divide
+from softmode.objects.rooms import crop_of, scene_crop
+from softmode.splats.components import label_components
+from softmode.splats.splats import Splats, joined, rotations_from_quats
 
-Part = Literal["thickest", "tallest", "largest", "all"]
+Rule = Literal["thickest", "tallest", "largest", "all"]
+Part = Rule | tuple[int, ...]
 
 GROUND_SHARE = 0.05
 """Least share of a capture's area that can be ground."""
@@ -20,48 +25,106 @@ GROUND_COVER = 0.5
 """Of ground less than this has anything above it: the side of a solid has the other side behind it."""
 SURROUNDED = 0.05
 """A part with this share of another's splats, in the middle of it, is the object and the other one a room."""
+CANDIDATES = 9
+"""At most so many pieces and other parts have a number."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Choice:
     """The object of a capture, and what else there is."""
 
     part: Splats
-    """The object."""
-    ground_count: int = 0
-    """Number of splats of the ground beneath it."""
-    other: Splats | None = None
-    """The part with most splats of the others, if it has a twentieth of the object's."""
+    """The object, closed by a floor where it was cut off what carries it."""
+    rows: NDArray[np.intp]
+    """Its splats in the capture, in its order; what closes it comes after them."""
+    number: NDArray[np.intp]
+    """Number of the candidate that each splat of the capture belongs to, from 1 on, shape (N,); 0 for the ground and
+    floaters. The first is the topmost piece of the object's part, the next carry it, others are parts of their own."""
+    taken: tuple[int, ...]
+    """The candidates that are taken."""
+    told: dict[str, str | int | float]
+    """What was found, for the report."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Ground:
+    """The plane that everything else stands on."""
+
+    splats: NDArray[np.bool_]
+    """Which splats are the ground, shape (N,)."""
+    normal: NDArray[np.float64]
+    """Its normal, towards what stands on it, shape (3,)."""
 
 
 def choose_part(splats: Splats, rule: Part) -> Choice:
     """Return the part of a capture that is the object, by the rule of `ObjectConfig.part`; all if nothing connects.
 
     The rules "thickest" and "tallest" first take away the ground on which everything stands. Where there was one, a
-    part that stands in the middle of another (a thing in a room) is taken before it.
+    part that stands in the middle of another (a thing in a room) is taken before it. By the rule "thickest" the object
+    is then cut off what carries it (`softmode.objects.carriers`). Numbers take the candidates that this rule finds.
+
+    Raises:
+        ConfigError: If there is no candidate of a number.
     """
     if rule == "all":
-        return Choice(part=splats)
-    ground = np.zeros(splats.count, dtype=bool) if rule == "largest" else find_ground(splats)
-    scene = splats.subset(~ground) if ground.any() else splats
+        every = np.arange(splats.count)
+        return Choice(part=splats, rows=every, number=np.ones_like(every), taken=(1,), told={})
+    ground = None if rule == "largest" else find_ground(splats)
+    scene = np.arange(splats.count) if ground is None else np.flatnonzero(~ground.splats)
+    gap, label = _linked(splats.subset(scene) if ground is not None else splats)
+    parts = [scene[label == k] for k in range(int(label.max(initial=-1)) + 1)] or [np.arange(splats.count)]
+    things, order = [splats.subset(rows) for rows in parts], list(range(len(parts)))
+    first = None
+    if rule == "largest":
+        chosen = 0
+    elif rule == "tallest":
+        chosen = max(order, key=lambda k: float(np.ptp(things[k].bounds(quantile=0.005)[:, 2])))
+    else:
+        chosen = first = max(order, key=lambda k: _thickness(things[k]))
+        while ground is not None and (inner := [k for k in order if _surrounds(things[chosen], things[k])]):
+            chosen = max(inner, key=lambda k: _thickness(things[k]))
+    number, others = np.zeros(splats.count, dtype=np.intp), [k for k in order if k != chosen]
+    pieces = None
+    if rule not in ("largest", "tallest"):
+        pieces = divide(things[chosen], None if ground is None else ground.normal, gap)
+    number[parts[chosen]] = 1 if pieces is None else pieces.number
+    count = 1 if pieces is None else pieces.count
+    for k, mark in zip(others, range(count + 1, CANDIDATES + 1), strict=False):
+        number[parts[k]] = mark
+    taken = rule if isinstance(rule, tuple) else tuple(range(1, 2 if pieces is None else pieces.top + 1))
+    if missing := set(taken) - set(number.tolist()):
+        raise ConfigError(
+            f"part {' '.join(map(str, sorted(missing)))}: the capture has the candidates 1 to {number.max()}",
+            hint="`softmode splat show FILE` draws them with their numbers",
+        )
+    part, rows = things[chosen], parts[chosen]
+    if set(taken) != set(range(1, count + 1)):
+        floors = [] if pieces is None else pieces.floors(set(taken), things[chosen])
+        rows = np.flatnonzero(np.isin(number, taken))
+        part = joined([splats.subset(rows), *floors], splats.name)
+    told: dict[str, str | int | float] = {"part_splats": len(rows), "floor_splats": part.count - len(rows)}
+    told["ground_splats"] = 0 if ground is None else int(ground.splats.sum())
+    other = next((things[k] for k in others if things[k].count >= SURROUNDED * things[chosen].count), None)
+    if other is not None:
+        told |= {"other_splats": other.count, "other_crop": crop_of(other), "other_part": count + 1}
+    if rule == "thickest":
+        told |= {} if pieces is None else pieces.told
+        if crop := scene_crop(
+            things[chosen], [things[k] for k in others], within=first not in (None, chosen), grounded=ground is not None
+        ):
+            told["scene_crop"] = crop
+    return Choice(part=part, rows=rows, number=number, taken=taken, told=told)
+
+
+def _linked(scene: Splats) -> tuple[float, NDArray[np.intp]]:
+    """Return the gap that parts the things of a scene, and the part of each of its splats (N,), -1 for none."""
     # The wider of a fraction of the capture and what its own pitch calls for: a small file of one object is sparse. Of
     # points strewn at random on a surface, n exp(-5.7 f^2) have no neighbour within f median sixth distances.
     low, high = scene.bounds(quantile=0.01)
     few = scene.means[:: max(1, scene.count // 20_000)]
     pitch = 1.5 * np.median(KDTree(scene.means).query(few, k=min(7, scene.count))[0][:, -1])
-    parts = split_components(scene, gap=max(0.015 * float(np.linalg.norm(high - low)), float(pitch), 1.0e-9))
-    if not parts:
-        return Choice(part=splats)
-    if rule == "largest":
-        chosen = parts[0]
-    elif rule == "tallest":
-        chosen = max(parts, key=lambda part: float(np.ptp(part.bounds(quantile=0.005)[:, 2])))
-    else:
-        chosen = max(parts, key=_thickness)
-        while ground.any() and (inner := [part for part in parts if _surrounds(chosen, part)]):
-            chosen = max(inner, key=_thickness)
-    other = next((part for part in parts if part is not chosen and part.count >= SURROUNDED * chosen.count), None)
-    return Choice(part=chosen, ground_count=int(ground.sum()), other=other)
+    gap = max(0.015 * float(np.linalg.norm(high - low)), float(pitch), 1.0e-9)
+    return gap, label_components(scene, gap=gap, faces=True)
 
 
 def _surrounds(part: Splats, inner: Splats) -> bool:
@@ -75,16 +138,16 @@ def _thickness(part: Splats) -> float:
     return float(np.linalg.eigvalsh(np.cov(part.means.astype(np.float64).T))[0])
 
 
-def find_ground(splats: Splats) -> NDArray[np.bool_]:
-    """Return which splats are the ground that everything else stands on, shape (N,); none if there is no such plane.
+def find_ground(splats: Splats) -> Ground | None:
+    """Return the ground that everything else stands on, None if there is no such plane.
 
     The ground is the plane with the largest area of splats that lie flat in it, provided that nine tenths of all else
-    lie on one side of it, rise well above it, and cover less than half of it.
+    lie on one side of it, rise well above it, and cover less than half of it. Of two planes that are taken for one, a
+    ground and a turntable on it, it is that of the fullest peak of heights.
     """
-    nothing = np.zeros(splats.count, dtype=bool)
     solid = np.flatnonzero(splats.opacities >= 0.2)
     if len(solid) < 200:
-        return nothing
+        return None
     x = splats.means[solid].astype(np.float64)
     scale = np.sort(splats.scales[solid].astype(np.float64), axis=1)
     thin = splats.scales[solid].argmin(axis=1)
@@ -104,7 +167,8 @@ def find_ground(splats: Splats) -> NDArray[np.bool_]:
         height = (x - middle) @ axis
         flat = (np.abs(height) < reach) & (np.abs(normal @ axis) > 0.8)
         if flat.sum() < 100:
-            return nothing
+            return None
+        flat = _fullest(height, flat, area)
         middle = x[flat].mean(axis=0)
         axis = np.linalg.svd((x[flat] - middle)[:: max(1, int(flat.sum()) // 5000)], full_matrices=False)[2][2]
         off = np.abs((x[flat] - middle) @ axis)
@@ -113,10 +177,11 @@ def find_ground(splats: Splats) -> NDArray[np.bool_]:
     flat = (np.abs(height) < reach) & (np.abs(normal @ axis) > 0.8)
     rest = np.abs(height) > 2.0 * reach
     if flat.sum() < 100 or area[flat].sum() < GROUND_SHARE * area.sum() or rest.sum() < 0.02 * len(x):
-        return nothing
-    above = height[rest] * np.sign(np.median(height[rest]))
+        return None
+    side_up = float(np.sign(np.median(height[rest])))
+    above = height[rest] * side_up
     if (above > 0.0).mean() < 0.9 or np.quantile(above, 0.9) < 5.0 * reach:
-        return nothing
+        return None
     side = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
     side /= np.linalg.norm(side)
     plan = (x - middle) @ np.stack([side, np.cross(axis, side)], axis=1)
@@ -127,9 +192,30 @@ def find_ground(splats: Splats) -> NDArray[np.bool_]:
     held, over = np.bincount(key[flat], minlength=key.max() + 1), np.bincount(key[rest], minlength=key.max() + 1)
     floor = held >= 2
     if (over[floor] >= 0.25 * held[floor]).mean() >= GROUND_COVER:
-        return nothing
+        return None
     every = np.abs((splats.means.astype(np.float64) - middle) @ axis) < reach
     faint = splats.opacities < 0.2
-    nothing[solid[flat]] = True
-    nothing[every & faint] = True
-    return nothing
+    found = every & faint
+    found[solid[flat]] = True
+    return Ground(splats=found, normal=side_up * axis)
+
+
+def _fullest(height: NDArray[np.float64], flat: NDArray[np.bool_], area: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which of flat splats lie around the fullest peak of heights; all of them if there is no other one."""
+    some = np.flatnonzero(flat)
+    if not np.ptp(height[some]) > 0.0:
+        return flat
+    bins = int(np.clip(len(some) // 50, 2, 60))
+    count, edge = np.histogram(height[some], bins=bins, weights=area[some])
+    smooth = ndimage.gaussian_filter1d(count, 1.5)
+    first = int(smooth.argmax())
+    off = np.abs(height[some] - 0.5 * (edge[first] + edge[first + 1]))
+    spread = max(float(np.median(off[off < 0.25 * np.ptp(height[some])])), float(edge[1] - edge[0]))
+    far = np.abs(np.arange(bins) - first) * (edge[1] - edge[0]) > 4.0 * spread
+    second = int(np.where(far, smooth, 0.0).argmax())
+    valley = smooth[min(first, second) : max(first, second) + 1].min()
+    if smooth[second] < 0.1 * smooth[first] or valley > 0.5 * smooth[second] or (off < 4.0 * spread).sum() < 100:
+        return flat
+    found = np.zeros_like(flat)
+    found[some[off < 4.0 * spread]] = True
+    return found

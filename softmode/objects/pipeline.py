@@ -1,11 +1,10 @@
-"""One line of stages from what an object is made of to the object: it stands, is reduced, and gets its splats.
-
-`load` and `build_object` are its entrances: :func:`softmode.objects.source.object_source` reads, what follows is here.
-"""
+"""Stages of :func:`softmode.objects.loader.load`: an object stands, is reduced, and gets its splats."""
 
 from __future__ import annotations
 
 import json
+import zlib
+from base64 import b85decode, b85encode
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -29,6 +28,7 @@ from softmode.objects.shapes.primitives import scaled, turned
 from softmode.objects.soft_object import SoftObject
 from softmode.objects.source import ObjectSource
 from softmode.splats.splats import Splats
+from softmode.stages import stage
 
 Array = NDArray[np.float64]
 
@@ -71,7 +71,8 @@ def standing_quadrature(config: ObjectConfig, source: ObjectSource) -> tuple[Qua
         AssetError: If it encloses no volume.
     """
     try:
-        quadrature = source.integrate()
+        with stage(f"integrating {source.name}"):
+            quadrature = source.integrate()
         turns = _may_turn(config) and config.surface_count != SURFACE_COUNT
         like = source.integrate(surface_count=SURFACE_COUNT) if turns else quadrature
     except AssetError as error:
@@ -136,7 +137,8 @@ def build_standing(
         progress: Passed to :func:`softmode.deformables.reduction.build_body.build_body`.
 
     Returns:
-        The body, whose `provenance` tells how it was laid down ("turn") and where it stands ("seat"), and its solid.
+        The body, whose `provenance` tells how it was laid down ("turn"), where it stands ("seat") and which splats of a
+        capture have solid under them ("shown"), and its solid.
     """
     quadrature, turn = standing_quadrature(config, source)
     seat, splats = seat_of(quadrature.bounds), _laid_down(source.splats, turn)
@@ -155,25 +157,34 @@ def build_standing(
         progress=progress,
     )
     frame = {"turn": json.dumps(turn.tolist()), "seat": json.dumps(seat.tolist())}
+    if "part_splats" in source.capture and quadrature.members is not None:
+        frame["shown"] = b85encode(zlib.compress(np.packbits(quadrature.members).tobytes())).decode()
     return replace(body, provenance={**body.provenance, **frame}), quadrature
 
 
 def dressed(body: ReducedBody, config: ObjectConfig, source: ObjectSource, material: Material | None) -> SoftObject:
     """Return a body with the splats and the field of its source in its frame; its provenance tells the asset.
 
-    What lies beyond an eighth of the body's size around its bounding box are floaters of the capture: left out.
+    Splats of a capture without solid under them are left out, as is what lies beyond an eighth of the body's size
+    around its bounding box.
     """
     turn = np.array(json.loads(str(body.provenance["turn"])))
     splats = _laid_down(source.splats, turn)
     low, high = body.bounds + body.offset
     margin = 0.125 * np.linalg.norm(high - low)
     near = ((splats.means >= low - margin) & (splats.means <= high + margin)).all(axis=1)
+    bare = 0
+    if (shown := body.provenance.get("shown")) is not None:
+        bits = np.frombuffer(zlib.decompress(b85decode(str(shown))), dtype=np.uint8)
+        near &= np.unpackbits(bits, count=splats.count).astype(bool)
+        bare = splats.count - int(near.sum())
     splats = splats.subset(near).transformed(translation=-body.offset)
     told = {
         "asset": source.name,
         "asset_kind": config.kind,
         "asset_splats": source.asset_splats,
-        "asset_left_out": source.asset_splats - splats.count,
+        "asset_left_out": source.asset_splats + int(source.capture.get("floor_splats", 0)) - splats.count,
+        "asset_bare_splats": bare,
     }
     if any(source.offset):
         told["asset_offset"] = json.dumps(source.offset)

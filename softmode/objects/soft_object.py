@@ -15,7 +15,7 @@ from softmode.deformables.contact.dents import DentWeights, dent_weights
 from softmode.deformables.materials.material import Material
 from softmode.deformables.reduction.cache import cached
 from softmode.deformables.reduction.report import Finding, object_findings
-from softmode.deformables.skinning.skin_splats import average_basis
+from softmode.deformables.skinning.averages import average_basis
 from softmode.errors import ConfigError, GraspError
 from softmode.files import read_archive, write_archive
 from softmode.objects.config import ObjectConfig
@@ -23,6 +23,7 @@ from softmode.objects.rest_grasps import rest_grasps
 from softmode.radiance.grid import RadianceGrid
 from softmode.robots.jaws import ParallelJaw
 from softmode.splats.splats import Splats
+from softmode.stages import stage
 
 Array = NDArray[np.float64]
 
@@ -118,7 +119,8 @@ class SoftObject:
         means, covariances = splats.means, splats.covariances()
 
         def make() -> tuple[Array, Array]:
-            return average_basis(body, means, covariances)
+            with stage(f"averaging functions over {splats.count} splats"):
+                return average_basis(body, means, covariances)
 
         def read(path: Path) -> tuple[Array, Array]:
             found = read_archive(path, "softmode.averages", 1)[1]

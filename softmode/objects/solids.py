@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from softmode.deformables.materials.material import Material
@@ -23,6 +23,7 @@ from softmode.mpm import MORPH_MATERIAL, ParticleBody, particles_from_shape
 from softmode.objects.config import ObjectConfig
 from softmode.objects.object_file import file_kind
 from softmode.objects.pipeline import standing_quadrature
+from softmode.objects.shapes.level_sets import Level, ball, box, capsule, cylinder, ellipsoid, level_slope, torus
 from softmode.objects.shapes.primitives import KEY_LIGHT, Color, checker
 from softmode.objects.source import DEFAULT_COLORS, object_source
 from softmode.splats.mesh_samples import eliminate_samples
@@ -30,7 +31,6 @@ from softmode.splats.point_cloud import splats_from_points
 from softmode.splats.splats import Splats
 
 Array = NDArray[np.float64]
-Level = Callable[[Array], Array]
 
 SPLAT_COUNT = 8_000
 """Splats on a named shape or mesh."""
@@ -42,6 +42,8 @@ SHELL = 0.02
 """Half thickness of the shell in which they are drawn."""
 CORNER = 3
 """Neighbours of a lattice point at the corner of a box."""
+SLOPE_STEP = 1.0e-4
+"""Step of the differences that give a level-set function's slope."""
 GLYPH = 96
 """Pixels of a letter's height."""
 VOLUME = 4.0 / 3.0 * np.pi * 6.93**3
@@ -198,9 +200,9 @@ def _solid_of_level(name: str, level: Level, bounds: Array, colors: tuple[Color,
         filled, drawn = filled + int((value < 0.0).sum()), drawn + len(x)
     area = len(near) / drawn * float(size.prod()) / (2.0 * SHELL)
     for _ in range(3):
-        slope = _slope(level, near)
+        slope = level_slope(level, near, SLOPE_STEP)
         near = near - level(near)[:, None] * slope / np.maximum((slope**2).sum(axis=1, keepdims=True), 0.04)
-    slope = _slope(level, near)
+    slope = level_slope(level, near, SLOPE_STEP)
     normals = slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-9)
     kept = eliminate_samples(near, normals, area, SPLAT_COUNT)
     points, normals = near[kept], normals[kept]
@@ -215,11 +217,6 @@ def _solid_of_level(name: str, level: Level, bounds: Array, colors: tuple[Color,
     )
 
 
-def _slope(level: Level, points: Array, step: float = 1.0e-4) -> Array:
-    """Return central differences of a function, shape (N, 3)."""
-    return np.stack([level(points + e) - level(points - e) for e in step * np.eye(3)], axis=1) / (2.0 * step)
-
-
 def _asset(name: str) -> ObjectConfig:
     """Return a mesh that newton installs, upright."""
     with needs_extra("usd", f"the {name} is an OpenUSD asset of newton"):
@@ -231,92 +228,51 @@ def _asset(name: str) -> ObjectConfig:
 # -- level sets -------------------------------------------------------------------------------------------------------
 
 
-def _ellipsoid(x: Array, centre: ArrayLike, radii: ArrayLike) -> Array:
-    """Return about the distance to an ellipsoid."""
-    r = np.asarray(radii, dtype=np.float64)
-    at = (x - np.asarray(centre)) / r
-    length = np.linalg.norm(at, axis=1)
-    slope = np.linalg.norm(at / r, axis=1)
-    return np.where(slope > 1e-9, length * (length - 1.0) / np.maximum(slope, 1e-9), -r.min())
-
-
-def _capsule(x: Array, a: ArrayLike, b: ArrayLike, radius: float) -> Array:
-    """Return the distance to a segment a-b swept by a radius."""
-    start, along = np.asarray(a, dtype=np.float64), np.subtract(b, a).astype(np.float64)
-    t = np.clip((x - start) @ along / (along @ along), 0.0, 1.0)
-    return np.linalg.norm(x - start - t[:, None] * along, axis=1) - radius
-
-
-def _box(x: Array, centre: ArrayLike, half: ArrayLike, rounding: float) -> Array:
-    """Return the distance to a box with round edges."""
-    away = np.abs(x - np.asarray(centre)) - (np.asarray(half) - rounding)
-    return np.linalg.norm(np.maximum(away, 0.0), axis=1) + np.minimum(away.max(axis=1), 0.0) - rounding
-
-
-def _torus(x: Array, centre: ArrayLike, major: float, minor: float, axis: int) -> Array:
-    """Return the distance to a ring."""
-    at = x - np.asarray(centre)
-    across = np.linalg.norm(np.delete(at, axis, axis=1), axis=1)
-    return np.hypot(across - major, at[:, axis]) - minor
-
-
-def _cylinder(x: Array, centre: ArrayLike, radius: float, half: float, axis: int) -> Array:
-    """Return the distance to a disc or rod."""
-    at = x - np.asarray(centre)
-    away = np.stack([np.linalg.norm(np.delete(at, axis, axis=1), axis=1) - radius, np.abs(at[:, axis]) - half], axis=1)
-    return np.linalg.norm(np.maximum(away, 0.0), axis=1) + np.minimum(away.max(axis=1), 0.0)
-
-
-def _joined(parts: list[Array], blend: float) -> Array:
+def _joined(blend: float, *parts: Level) -> Level:
     """Return the union of parts, round where they meet."""
-    stack = np.stack(parts)
-    least = stack.min(axis=0)
-    return least - blend * np.log(np.exp(-(stack - least) / blend).sum(axis=0))
+
+    def level(x: Array) -> Array:
+        stack = np.stack([part(x) for part in parts])
+        least = stack.min(axis=0)
+        return least - blend * np.log(np.exp(-(stack - least) / blend).sum(axis=0))
+
+    return level
 
 
-def _duck(x: Array) -> Array:
+def _duck() -> Level:
     """Return a swimming ring with the head of a duck."""
     return _joined(
-        [
-            _torus(x, (0.0, 0.0, 0.0), 0.33, 0.17, 2),
-            _capsule(x, (-0.31, 0.0, 0.05), (-0.34, 0.0, 0.3), 0.11),
-            _ellipsoid(x, (-0.34, 0.0, 0.4), (0.17, 0.16, 0.16)),
-            _ellipsoid(x, (-0.52, 0.0, 0.37), (0.09, 0.09, 0.05)),
-            _capsule(x, (0.4, 0.0, 0.05), (0.48, 0.0, 0.22), 0.06),
-        ],
         0.015,
+        torus(0.33, 0.17),
+        capsule((-0.31, 0.0, 0.05), (-0.34, 0.0, 0.3), 0.11),
+        ellipsoid((0.17, 0.16, 0.16), (-0.34, 0.0, 0.4)),
+        ellipsoid((0.09, 0.09, 0.05), (-0.52, 0.0, 0.37)),
+        capsule((0.4, 0.0, 0.05), (0.48, 0.0, 0.22), 0.06),
     )
 
 
-def _cow(x: Array) -> Array:
+def _cow() -> Level:
     """Return a four-legged animal with a head, ears and a tail."""
-    legs = [
-        _capsule(x, (dx, dy, -0.1), (1.15 * dx, 1.2 * dy, -0.4), 0.09) for dx in (-0.22, 0.22) for dy in (-0.13, 0.13)
-    ]
-    ears = [_capsule(x, (-0.38, 0.12 * s, 0.33), (-0.36, 0.25 * s, 0.42), 0.05) for s in (-1.0, 1.0)]
+    feet = [(dx, dy) for dx in (-0.22, 0.22) for dy in (-0.13, 0.13)]
     return _joined(
-        [
-            _ellipsoid(x, (0.0, 0.0, 0.0), (0.38, 0.26, 0.25)),
-            _capsule(x, (-0.22, 0.0, 0.05), (-0.36, 0.0, 0.22), 0.14),
-            _ellipsoid(x, (-0.42, 0.0, 0.25), (0.17, 0.17, 0.16)),
-            _capsule(x, (0.34, 0.0, 0.1), (0.44, 0.0, -0.05), 0.045),
-            *legs,
-            *ears,
-        ],
         0.02,
+        ellipsoid((0.38, 0.26, 0.25)),
+        capsule((-0.22, 0.0, 0.05), (-0.36, 0.0, 0.22), 0.14),
+        ellipsoid((0.17, 0.17, 0.16), (-0.42, 0.0, 0.25)),
+        capsule((0.34, 0.0, 0.1), (0.44, 0.0, -0.05), 0.045),
+        *(capsule((dx, dy, -0.1), (1.15 * dx, 1.2 * dy, -0.4), 0.09) for dx, dy in feet),
+        *(capsule((-0.38, 0.12 * s, 0.33), (-0.36, 0.25 * s, 0.42), 0.05) for s in (-1.0, 1.0)),
     )
 
 
-def _car(x: Array) -> Array:
+def _car() -> Level:
     """Return a car."""
-    wheels = [_cylinder(x, (dx, dy, -0.16), 0.12, 0.05, 1) - 0.015 for dx in (-0.28, 0.28) for dy in (-0.2, 0.2)]
+    axles = [(dx, dy) for dx in (-0.28, 0.28) for dy in (-0.2, 0.2)]
     return _joined(
-        [
-            _box(x, (0.0, 0.0, -0.06), (0.5, 0.22, 0.1), 0.07),
-            _box(x, (0.05, 0.0, 0.1), (0.25, 0.19, 0.12), 0.09),
-            *wheels,
-        ],
         0.015,
+        box((1.0, 0.44, 0.2), (0.0, 0.0, -0.06), 0.07),
+        box((0.5, 0.38, 0.24), (0.05, 0.0, 0.1), 0.09),
+        *(cylinder(0.12, dy - 0.05, dy + 0.05, (dx, -0.16), axis=1, rounding=0.015) for dx, dy in axles),
     )
 
 
@@ -370,13 +326,13 @@ _YELLOW: tuple[Color, Color] = ((0.95, 0.76, 0.20), (0.98, 0.90, 0.60))
 _BROWN: tuple[Color, Color] = ((0.55, 0.38, 0.26), (0.95, 0.93, 0.90))
 _GREEN: tuple[Color, Color] = ((0.30, 0.62, 0.40), (0.85, 0.94, 0.82))
 _SHAPES: dict[str, tuple[Level, tuple[float, float, float], tuple[Color, Color]]] = {
-    "sphere": (partial(_ellipsoid, centre=(0.0,) * 3, radii=(0.5,) * 3), (0.55, 0.55, 0.55), DEFAULT_COLORS),
-    "box": (partial(_box, centre=(0.0,) * 3, half=(0.5,) * 3, rounding=0.05), (0.55, 0.55, 0.55), _GREEN),
-    "cylinder": (partial(_cylinder, centre=(0.0,) * 3, radius=0.35, half=0.5, axis=2), (0.4, 0.4, 0.55), _BLUE),
-    "torus": (partial(_torus, centre=(0.0,) * 3, major=0.345, minor=0.155, axis=1), (0.55, 0.2, 0.55), _BLUE),
+    "sphere": (ball(0.5), (0.55, 0.55, 0.55), DEFAULT_COLORS),
+    "box": (box((1.0,) * 3, rounding=0.05), (0.55, 0.55, 0.55), _GREEN),
+    "cylinder": (cylinder(0.35, -0.5, 0.5), (0.4, 0.4, 0.55), _BLUE),
+    "torus": (torus(0.345, 0.155, axis=1), (0.55, 0.2, 0.55), _BLUE),
     "star": (_star, (0.52, 0.16, 0.55), _YELLOW),
-    "duck": (_duck, (0.7, 0.55, 0.6), _YELLOW),
-    "cow": (_cow, (0.7, 0.4, 0.55), _BROWN),
-    "car": (_car, (0.55, 0.3, 0.35), _RED),
+    "duck": (_duck(), (0.7, 0.55, 0.6), _YELLOW),
+    "cow": (_cow(), (0.7, 0.4, 0.55), _BROWN),
+    "car": (_car(), (0.55, 0.3, 0.35), _RED),
 }
 """Level-set function, half edges of a box that holds it, and colours by name."""

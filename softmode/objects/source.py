@@ -41,6 +41,7 @@ from softmode.splats.formats import read_splats
 from softmode.splats.formats.common import offset_note
 from softmode.splats.point_cloud import is_point_cloud, read_points
 from softmode.splats.splats import Splats, up_rotation
+from softmode.stages import stage
 
 DEFAULT_COLORS: tuple[Color, Color] = ((0.93, 0.55, 0.22), (0.97, 0.90, 0.76))
 """Colours of a shape that is given none."""
@@ -173,7 +174,7 @@ def _splat_source(config: ObjectConfig, given: str | Path | Splats | None) -> Ob
     splats, told, capture, name = _upright_splats(config, given)
     arrays = (splats.means, splats.scales, splats.quats, splats.opacities)
     solid = partial(quadrature_from_splats, *arrays, surface_count=config.surface_count, resolution=config.resolution)
-    key = ("splats", *arrays, config.resolution)
+    key = ("splats, shown", *arrays, config.resolution)
     count = int(capture["asset_splats"])
     return ObjectSource(splats, solid, name, key, count, config.longest_edge, None, capture, told.offset, told.notes)
 
@@ -207,13 +208,9 @@ def _upright_splats(
         name, stray, given = "plush", 0.0, splats.count
     else:
         cropped, name = _cropped_splats(config, source)
-        choice = choose_part(cropped, config.part)
-        splats, stray, given = choice.part, 0.002, cropped.count
-        capture = {"part_splats": splats.count, "ground_splats": choice.ground_count}
-        if choice.other is not None:
-            low, high = choice.other.bounds(quantile=0.002)
-            box = np.concatenate([low - 0.02 * (high - low), high + 0.02 * (high - low)])
-            capture |= {"other_splats": choice.other.count, "other_crop": " ".join(f"{x:.4g}" for x in box)}
+        with stage("finding the object in the capture"):
+            choice = choose_part(cropped, config.part)
+        splats, stray, given, capture = choice.part, 0.002, cropped.count, dict(choice.told)
     bounds = splats.bounds(quantile=stray)
     extent = float(np.ptp(bounds, axis=0).max())
     if not extent > 0.0:

@@ -10,19 +10,12 @@ from typing import TYPE_CHECKING
 from softmode.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from softmode.radiance.bake import splats_from_radiance
-    from softmode.radiance.formats import read_radiance, write_radiance
-    from softmode.radiance.grid import RadianceGrid
-    from softmode.radiance.march import MarchOptions, RadianceMarch, render_radiance
-
-__all__ = [
-    "MarchOptions",
-    "RadianceGrid",
-    "RadianceMarch",
-    "read_radiance",
-    "render_radiance",
-    "splats_from_radiance",
-    "write_radiance",
-]
+    from softmode.radiance.bake import splats_from_radiance as splats_from_radiance
+    from softmode.radiance.formats import read_radiance as read_radiance
+    from softmode.radiance.formats import write_radiance as write_radiance
+    from softmode.radiance.grid import RadianceGrid as RadianceGrid
+    from softmode.radiance.march import MarchOptions as MarchOptions
+    from softmode.radiance.march import RadianceMarch as RadianceMarch
+    from softmode.radiance.march import render_radiance as render_radiance
 
 __getattr__, __dir__ = lazy_names(__name__)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from softmode.errors import ConfigError
-from softmode.robots.description import RobotDescription, ToolPose
+from softmode.robots.description import RobotDescription, ToolPose, followed
 
 Array = NDArray[np.float64]
 STILL = 1.0e-13
@@ -65,7 +65,7 @@ class SerialChain:
 
     def followed(self, q: Array) -> Array:
         """Return coordinates (B, n) with those of followers where their ties have them."""
-        return np.where(self.follows, self.offset + self.ratio * q[:, self.leader], q)
+        return followed(q, self.leader, self.ratio, self.offset)
 
     def _folded(self, jacobian: Array) -> Array:
         """Return a Jacobian whose columns of leaders have those of their followers, which become zero."""
@@ -160,17 +160,14 @@ class SerialChain:
         q = low + (high - low) * random.random((4000, len(low)))
         q = np.concatenate([q[np.argsort(distance(q))[-15:]], self.home[None]])
         best, step = distance(q), 0.4
-        while step > 1.0e-4:
-            improved = False
-            for k in range(len(low)):
-                for sign in (step, -step):
-                    trial = q.copy()
-                    trial[:, k] = np.clip(trial[:, k] + sign, low[k], high[k])
-                    far = distance(trial)
-                    better = far > best + 1.0e-9
-                    q[better], best = trial[better], np.maximum(best, far)
-                    improved |= bool(better.any())
-            step = step if improved else 0.5 * step
+        moves = np.concatenate([np.eye(len(low)), -np.eye(len(low))])
+        while step > 1.0e-4:  # the best step of any one joint, while there is one
+            trial = np.clip(q[:, None] + step * moves, low, high)
+            far = distance(trial.reshape(-1, len(low))).reshape(len(q), -1)
+            better = far.max(axis=1) > best + 1.0e-9
+            q[better] = trial[better, far.argmax(axis=1)[better]]
+            best = np.maximum(best, far.max(axis=1))
+            step = step if better.any() else 0.5 * step
         return float(best.max())
 
 
@@ -212,18 +209,12 @@ def serial_chain(robot: RobotDescription, frame: ToolPose = (0.0, 0.0, 0.0, 0.0,
     place = np.array(robot.tool[:3]) + inside.apply(frame[:3])
     turn = (inside * Rotation.from_quat(frame[3:])).as_matrix()
     leader, ratio, offset = np.arange(len(joints)), np.ones(len(joints)), np.zeros(len(joints))
-    group = {j: (j, 1.0, 0.0) for j in joints}
-    group |= {
-        names.index(tie.joint): (names.index(tie.leader), tie.ratio, tie.offset)
-        for names in [list(robot.joint_names)]
-        for tie in robot.ties
-    }
+    leads, slope, shift = robot.bound
     for k, j in enumerate(joints):
         # The first joint of the chain that has the same leader, which may stand elsewhere, leads here.
-        first = next(i for i in range(k + 1) if group[joints[i]][0] == group[j][0])
-        _, a, b = group[joints[first]]
-        leader[k], ratio[k] = first, group[j][1] / a
-        offset[k] = group[j][2] - ratio[k] * b
+        first = next(i for i in range(k + 1) if leads[joints[i]] == leads[j])
+        leader[k], ratio[k] = first, slope[j] / slope[joints[first]]
+        offset[k] = shift[j] - ratio[k] * shift[joints[first]]
     return SerialChain(
         joints=tuple(joints),
         axis=data.xaxis[joints].copy(),

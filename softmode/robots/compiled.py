@@ -24,8 +24,13 @@ import numpy as np
 from softmode.deformables.coupling.rigid_solver import mujoco_warnings
 from softmode.errors import AssetError, ConfigError
 from softmode.robots.assets import RobotAsset
-from softmode.robots.description import JointDrive, RobotGripper, ToolPose
+from softmode.robots.description import JointDrive, RobotGripper, ToolPose, followed
 from softmode.robots.hand import find_end_effector, find_gripper
+
+_HELD_OFF = 0.02
+"""How far dry friction may hold a joint without servo from its target [rad or m]."""
+_LEAST_LAG = 0.01
+"""Least damping of such a drive over its stiffness [s], with which a step of the simulation resolves it."""
 
 
 @dataclass
@@ -105,22 +110,16 @@ class CompiledRobot:
         """Return the home pose within the joint limits."""
         if given is None:
             values = np.array([self.at_home.get(name, 0.0) for name in self.joint_names]) - self.reference
-            return np.clip(self._followed(np.clip(values, self.lower, self.upper)), self.lower, self.upper)
+            return np.clip(followed(np.clip(values, self.lower, self.upper), *self.bound), self.lower, self.upper)
         values = np.asarray(given, float)
         if values.shape != (len(self.joint_names),) or not np.all(np.isfinite(values)):
             hint = f"give one number for each of {', '.join(self.joint_names)}"
             raise ConfigError(f"home has shape {values.shape} or holds a value that is not finite", hint=hint)
-        followed = self._followed(values)
-        for j in np.flatnonzero(np.abs(followed - values) > 1.0e-6):
+        tied = followed(values, *self.bound)
+        for j in np.flatnonzero(np.abs(tied - values) > 1.0e-6):
             leader = self.joint_names[self.bound[0][j]]
-            self.notes.append(f"home: {self.joint_names[j]!r} follows {leader!r}, so it is {followed[j]:.4g}")
-        return followed
-
-    def _followed(self, joint_q: np.ndarray) -> np.ndarray:
-        """Return coordinates whose followers are where the file's ties have them."""
-        owner, ratio, shift = self.bound
-        moved = np.array(shift) + np.array(ratio) * joint_q[owner]
-        return np.where(np.array(owner) == np.arange(len(owner)), joint_q, moved)
+            self.notes.append(f"home: {self.joint_names[j]!r} follows {leader!r}, so it is {tied[j]:.4g}")
+        return tied
 
     def data(self, joint_q: np.ndarray) -> Any:
         """Return the kinematics at a pose."""
@@ -220,6 +219,8 @@ class CompiledRobot:
                 self.notes.append(f"the drive of joint {name!r} has force limit 0: it does not move it")
         # A tie between driven joints is what their drives replace; one between passive joints stays.
         loops = (int(self.mujoco.mjtEq.mjEQ_CONNECT), int(self.mujoco.mjtEq.mjEQ_WELD))
+        if any(int(kind) in loops for kind in model.eq_type):
+            self.notes.append("loops are held by rows that give a little: a slider-crank passes on .990 of its force")
         for e in range(model.neq):
             name, tie = model.equality(e).name, self._tie(e)
             if tie is None and int(model.eq_type[e]) not in loops:
@@ -326,16 +327,17 @@ class CompiledRobot:
             poses.append(np.where(hinge, np.clip(0.25 * math.pi, 0.75 * low + 0.25 * high, high), 0.0))
         masses = np.zeros((len(poses), self.model.nv, self.model.nv))
         for mass, pose in zip(masses, poses, strict=True):
-            self.mujoco.mj_fullM(self.model, self.data(self._followed(pose)), mass)
+            self.mujoco.mj_fullM(self.model, self.data(followed(pose, *self.bound)), mass)
         return masses.diagonal(axis1=1, axis2=2).max(axis=0)
 
     def _default_drive(self, j: int, limit: float) -> JointDrive:
         """Return a critically damped drive for a joint without servo."""
         mass, omega, loss = self._inertias[j], 2.0 * math.pi * self.bandwidth, self.model.dof_damping[j]
+        # Against much viscous friction the joint would creep to its target; dry friction would hold it away from it.
+        stiffness = float(max(mass * omega**2, 0.5 * loss * omega, self.model.dof_frictionloss[j] / _HELD_OFF))
         return JointDrive(
-            # Against much viscous friction the joint would creep to its target.
-            stiffness=float(max(mass * omega**2, 0.5 * loss * omega)),
-            damping=float(max(2.0 * mass * omega - loss, 0.0)),
+            stiffness=stiffness,
+            damping=float(max(2.0 * mass * omega - loss, _LEAST_LAG * stiffness - loss, 0.0)),
             effort_limit=limit,
             lower=float(self.lower[j]),
             upper=float(self.upper[j]),

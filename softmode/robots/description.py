@@ -13,6 +13,7 @@ from typing import Any, Literal
 import newton
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
 from softmode.checks import require_choice, require_fields
 from softmode.deformables.coupling.rigid_solver import mujoco_warnings
@@ -57,6 +58,20 @@ class JointTie:
     """Travel for a unit of the leader's."""
     offset: float
     """Coordinate where the leader's is zero [m or rad]."""
+
+
+def followed(joint_q: ArrayLike, leader: ArrayLike, ratio: ArrayLike, offset: ArrayLike) -> np.ndarray:
+    """Return joint coordinates (..., n) with those of followers where their ties have them.
+
+    Args:
+        joint_q: Coordinates [m or rad], shape (..., n).
+        leader: Which joint each one follows, itself for most, shape (n,).
+        ratio: Travel of each for a unit of its leader's, shape (n,).
+        offset: Coordinate of each where its leader's is zero, shape (n,).
+    """
+    values, owner = np.array(joint_q, float), np.asarray(leader)
+    moved = np.asarray(offset) + np.asarray(ratio) * values[..., owner]
+    return np.where(owner == np.arange(len(owner)), values, moved)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,20 +153,25 @@ class RobotDescription:
     @property
     def model(self) -> Any:
         """The robot as MuJoCo compiles it, one for all that ask: not to be changed."""
-        return _compiled(self.mjcf)
+        return compiled(self.mjcf)
 
     @property
     def home_joint_q(self) -> np.ndarray:
         """Joint coordinates of the home pose [m or rad], shape (joint_count,)."""
         return np.array(self.home)
 
+    @property
+    def bound(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Per joint its leader, itself for most, and ratio and offset of q = offset + ratio q_leader."""
+        leader, ratio, offset = np.arange(len(self.home)), np.ones(len(self.home)), np.zeros(len(self.home))
+        for tie in self.ties:
+            j = self.joint_names.index(tie.joint)
+            leader[j], ratio[j], offset[j] = self.joint_names.index(tie.leader), tie.ratio, tie.offset
+        return leader, ratio, offset
+
     def followed(self, joint_q: Sequence[float] | np.ndarray) -> np.ndarray:
         """Return joint coordinates [m or rad] with those of followers where their ties have them."""
-        values = np.array(joint_q, float)
-        for tie in self.ties:
-            leader = values[self.joint_names.index(tie.leader)]
-            values[self.joint_names.index(tie.joint)] = tie.offset + tie.ratio * leader
-        return values
+        return followed(joint_q, *self.bound)
 
     @property
     def passive_joints(self) -> tuple[str, ...]:
@@ -356,7 +376,7 @@ class RobotIndices:
 
 
 @functools.lru_cache(8)
-def _compiled(mjcf: str) -> Any:
+def compiled(mjcf: str) -> Any:
     """Return the compiled model of a robot."""
     with mujoco_warnings():
         return importlib.import_module("mujoco").MjModel.from_xml_string(mjcf)

@@ -29,6 +29,8 @@ class Compiled(Protocol):
     reference: Array
     ties: tuple[list[int], list[float], list[float]]
     passive: list[int]
+    lower: Array
+    upper: Array
 
     def link(self, body: int) -> str:
         """Return the name of a link."""
@@ -54,6 +56,8 @@ _PATTERNS = (
     "*_hand *hand_link *palm *palm_link *gripper_base* *gripper_link *gripper *tool_link *tool *flange"
 ).split()
 """Patterns of the last part of such a name, in small letters, tried after the names."""
+_BESIDE = 0.7
+"""How far a hand's own jaw must stand out beside the one that moves, as a share of that one's length."""
 _POINTS = 400
 """How many corners of a finger the closing test looks at."""
 _SPREAD = 0.1
@@ -66,8 +70,17 @@ def find_end_effector(robot: Compiled, drives: Sequence[JointDrive | None]) -> t
     """Return the name of a site or link that carries the tool, and how it was found.
 
     Names, then patterns, each among the sites first; then the link in which two fingers that close on each other meet;
-    then the last link of the chain with the most joints.
+    then the last link of the chain with the most joints. If that is the jaw of a hand that moves: what is before it.
     """
+    name, how = _found(robot, drives)
+    links = {robot.link(b): b for b in range(1, robot.model.nbody)}
+    if name in links and _is_jaw(robot, drives, links[name]):
+        return robot.link(robot.model.body_parentid[links[name]]), f"link on whose own jaw {name!r} closes"
+    return name, how
+
+
+def _found(robot: Compiled, drives: Sequence[JointDrive | None]) -> tuple[str, str]:
+    """Return the name of a site or link by its name or place, and how it was found."""
     model = robot.model
     sites = [model.site(s).name for s in range(model.nsite)]
     links = [robot.link(b) for b in range(1, model.nbody)]
@@ -89,12 +102,33 @@ def find_end_effector(robot: Compiled, drives: Sequence[JointDrive | None]) -> t
     for palm in _above(model, last):
         joints = _limited(robot, drives, palm)
         longest = max((depth[b] - depth[palm] for b in robot.behind(palm)), default=0)
-        fingers = {_branch(model, palm, j) for j in joints}
+        fingers = {branch(model, palm, j) for j in joints}
         if len(fingers) < 2 or longest > (2 if len(fingers) == 2 else 5):
             continue
         if closing_ends(robot, drives, robot.home(None), palm, joints):
             return robot.link(palm), f"link in which {len(fingers)} fingers meet that close on each other"
     return robot.link(last), "last link of the longest chain; it has no usual name"
+
+
+def _is_jaw(robot: Compiled, drives: Sequence[JointDrive | None], link: int) -> bool:
+    """Return whether a link that ends a chain is a jaw: at an end of its range it lies along what is in front of it."""
+    model, front = robot.model, int(robot.model.body_parentid[link])
+    j = int(model.body_jntadr[link])
+    if j < 0 or j not in _limited(robot, drives, front) or _limited(robot, drives, link):
+        return False
+    rest = [b for b in range(1, model.nbody) if model.body_weldid[b] == model.body_weldid[front]]
+    for q in (robot.lower[j], robot.upper[j]):
+        joint_q = robot.home(None)
+        joint_q[j] = q
+        data = settled(model, joint_q + robot.reference, ())
+        jaw, fixed = (surface_corners(model, data, side) - data.xanchor[j] for side in (robot.behind(link), rest))
+        if not len(jaw) or not len(fixed):
+            return False
+        out = jaw.mean(0) / np.linalg.norm(jaw.mean(0))
+        forward = out @ (data.xanchor[j] - data.xpos[model.body_weldid[front]]) > 0.0  # not folded back
+        if forward and abs(out @ data.xaxis[j]) < 0.5 and (fixed @ out).max() > _BESIDE * (jaw @ out).max():
+            return True
+    return False
 
 
 def find_gripper(
@@ -111,7 +145,7 @@ def find_gripper(
         joints = _limited(robot, drives, palm)
     if not joints:
         return {}, link, []
-    while len(inner := {_branch(model, palm, j) for j in joints}) == 1 and not model.body_jntnum[min(inner)]:
+    while len(inner := {branch(model, palm, j) for j in joints}) == 1 and not model.body_jntnum[min(inner)]:
         palm = min(inner)  # a mount between them
     ends = closing_ends(robot, drives, start, palm, joints)
     left = [repr(robot.joint_names[j]) for j in joints if j not in ends]
@@ -129,7 +163,7 @@ def closing_ends(
     """
     model = robot.model
     owner, ratio, shift = robot.ties
-    fingers = {b: side_of(model, palm, b) for b in sorted({_branch(model, palm, j) for j in joints})}
+    fingers = {b: side_of(model, palm, b) for b in sorted({branch(model, palm, j) for j in joints})}
     moved = {b for side in fingers.values() for b in side}
     rest = [palm, *(b for b in robot.behind(palm) if b not in moved and _fixed_to(model, b, palm))]
     ends: dict[int, tuple[float, float]] = {}
@@ -149,7 +183,7 @@ def closing_ends(
         sides = opposed(posed(j, drive.lower), posed(j, drive.upper), sides)
     for j, drive in driven:
         first = next(i for i in joints if owner[i] == owner[j])
-        own = next(sorted(side) for side in sides if _branch(model, palm, j) in side)
+        own = next(sorted(side) for side in sides if branch(model, palm, j) in side)
         others = [b for side in sides for b in sorted(side) if b not in own]
         # Two fingers close on each other, one on the palm's own jaw, several on the palm.
         towards = others if len(sides) == 2 and others else rest
@@ -205,17 +239,23 @@ def settled(model: Any, joint_q: Array, moving: Sequence[int]) -> Any:
 
 def surface_corners(model: Any, data: Any, links: Sequence[int]) -> Array:
     """Return corners of the colliding shapes of links in the world, (N, 3) [m]: a mesh's vertices, else of its box."""
-    found = []
-    for geom in colliding(model, links):
-        mesh = int(model.geom_dataid[geom])
-        if mesh >= 0:
-            start = model.mesh_vertadr[mesh]
-            local = np.asarray(model.mesh_vert[start : start + model.mesh_vertnum[mesh]], float)
-        else:
-            signs = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), axis=-1).reshape(-1, 3)
-            local = model.geom_aabb[geom, :3] + signs * model.geom_aabb[geom, 3:]
-        found.append(data.geom_xpos[geom] + local @ data.geom_xmat[geom].reshape(3, 3).T)
+    return in_world(data, {geom: geom_corners(model, geom) for geom in colliding(model, links)})
+
+
+def in_world(data: Any, points: dict[int, Array]) -> Array:
+    """Return points that are given in the frames of shapes in the world, (N, 3) [m]."""
+    found = [data.geom_xpos[geom] + local @ data.geom_xmat[geom].reshape(3, 3).T for geom, local in points.items()]
     return np.concatenate(found) if found else np.empty((0, 3))
+
+
+def geom_corners(model: Any, geom: int) -> Array:
+    """Return corners of a shape in its frame, (N, 3) [m]."""
+    mesh = int(model.geom_dataid[geom])
+    if mesh >= 0:
+        start = model.mesh_vertadr[mesh]
+        return np.asarray(model.mesh_vert[start : start + model.mesh_vertnum[mesh]], float)
+    signs = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), axis=-1).reshape(-1, 3)
+    return model.geom_aabb[geom, :3] + signs * model.geom_aabb[geom, 3:]
 
 
 def colliding(model: Any, links: Sequence[int]) -> list[int]:
@@ -253,7 +293,7 @@ def _above(model: Any, link: int) -> list[int]:
     return found
 
 
-def _branch(model: Any, palm: int, joint: int) -> int:
+def branch(model: Any, palm: int, joint: int) -> int:
     """Return the link next to the palm on the way to a joint's link."""
     link = int(model.jnt_bodyid[joint])
     while int(model.body_parentid[link]) != palm:

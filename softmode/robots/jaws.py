@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from softmode.checks import require_fields
 from softmode.errors import ConfigError
 from softmode.robots.arm import ArmDescription
 from softmode.robots.arm_shapes import finger_parts, hand_parts
-from softmode.robots.description import RobotDescription, ToolPose
-from softmode.robots.hand import colliding, opposed, settled, side_of, surface_corners
+from softmode.robots.description import RobotDescription, RobotGripper, ToolPose, compiled
+from softmode.robots.hand import colliding, geom_corners, in_world, opposed, settled, side_of, surface_corners
 
 Array = NDArray[np.float64]
 
@@ -25,6 +27,14 @@ _USUAL = 0.06
 """Width of what is usually grasped [m]."""
 _TIP = 0.01
 """How far behind the tip of a finger a link may end that counts as its pad [m]."""
+_JAW = 0.02
+"""How much of the tip of a jaw that turns counts as its pad [m]; it is open where its tip has come up by as much."""
+_DEEP = 0.75
+"""Share of the gap at its tips to which a jaw that turns may narrow where an object reaches into it."""
+_LEAST_OPENING = 0.03
+"""Least opening of a hand with one moving jaw that tasks can use [m]."""
+_SLIDE = 2
+"""MuJoCo's number of a joint that slides."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,6 +61,9 @@ class ParallelJaw:
     """Coulomb coefficient of the pads."""
     frame: ToolPose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
     """Pose of the middle between the pads in the tool's frame: position [m], quaternion (xyzw)."""
+    follow: float = 0.0
+    """By what share of the gap the middle moves along y as they open: 0.5, or -0.5, where one of them moves alone; its
+    `frame` is on the face of the other one."""
 
     def __post_init__(self) -> None:
         """Check the sizes."""
@@ -67,12 +80,12 @@ class ParallelJaw:
             robot: An `ArmDescription`, a `RobotDescription`, or a `TableRobot`, whose jaw has the frame of its tool.
 
         Raises:
-            ConfigError: If the robot has no two fingers, each with joints of its own, that close on each other.
+            ConfigError: If the robot has no two fingers that close on each other, nor one that closes on a fixed one.
         """
         if isinstance(robot, RobotDescription):
-            return _measured(robot)
+            return measured(robot)[1]
         if not isinstance(robot, ArmDescription):
-            return replace(robot.jaw, frame=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
+            return replace(robot.jaw, frame=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), follow=0.0)
         gripper = robot.gripper
         parts = [part for part in finger_parts(gripper.pad_size, gripper.finger_length, 1.0) if part.touch]
         palm = hand_parts(robot.hand_length, gripper.stroke)[-1].size
@@ -88,6 +101,13 @@ class ParallelJaw:
             friction=gripper.friction,
         )
 
+    def frame_at(self, gap: float) -> ToolPose:
+        """Return the frame's pose in that of the tool where the pads are so far apart [m]."""
+        if not self.follow:
+            return self.frame
+        x, y, z = Rotation.from_quat(self.frame[3:]).apply([0.0, self.follow * gap, 0.0]) + self.frame[:3]
+        return (float(x), float(y), float(z), *self.frame[3:])
+
 
 def gap_of(robot: RobotDescription, jaw: ParallelJaw, opening: float) -> float:
     """Return the distance between the faces of the fingers along the closing axis at an opening of the gripper [m].
@@ -99,8 +119,13 @@ def gap_of(robot: RobotDescription, jaw: ParallelJaw, opening: float) -> float:
     """
     model = robot.model
     data = _kinematics(robot, model, opening)
-    mount = data.xmat[model.body(robot.end_effector).id].reshape(3, 3)
+    link = model.body(robot.end_effector).id
+    mount = data.xmat[link].reshape(3, 3)
     turn = mount @ (Rotation.from_quat(robot.tool[3:]) * Rotation.from_quat(jaw.frame[3:])).as_matrix()
+    if jaw.follow:
+        inside = np.array(robot.tool[:3]) + Rotation.from_quat(robot.tool[3:]).apply(jaw.frame[:3])
+        place = (data.xpos[link] + mount @ inside) @ turn
+        return _one_gap(robot, data, turn, float(place[2]) - 0.5 * jaw.pad_length)
     y, z = turn[:, 1], turn[:, 2]
     left, right = (_pad_corners(model, data, side, z) @ y for side in _fingers(robot, model))
     # The closing axis may point from either finger to the other.
@@ -118,10 +143,113 @@ def dry_friction_of(robot: RobotDescription) -> float:
     return float(np.abs(wide - closed) @ model.dof_frictionloss)
 
 
-def _measured(robot: RobotDescription) -> ParallelJaw:
-    """Measure the jaw of a robot from a file."""
+def measured(robot: RobotDescription) -> tuple[RobotDescription, ParallelJaw]:
+    """Measure the jaw of a robot from a file; a gripper of one that turns alone gets the ends between which it grasps.
+
+    Raises:
+        ConfigError: If the robot has no two fingers that close on each other, nor one that closes on a fixed one.
+    """
     model = robot.model
     sides = _fingers(robot, model)
+    if int(model.body_parentid[sides[0][0]]) in sides[1]:
+        return _one_jaw(robot, sides)
+    return robot, _two_fingers(robot, sides)
+
+
+@functools.lru_cache(8)
+def _edges(mjcf: str, links: tuple[int, ...]) -> dict[int, Array]:
+    """Return both ends of the edges of the hulls of shapes of links, in their frames, (2 E, 3) [m]."""
+    model = compiled(mjcf)
+    hulls = {geom: ConvexHull(geom_corners(model, geom)) for geom in colliding(model, links)}
+    return {geom: hull.points[hull.simplices[:, [0, 1, 1, 2, 2, 0]]].reshape(-1, 3) for geom, hull in hulls.items()}
+
+
+def _within(ends: Array, low: float, high: float) -> Array:
+    """Return the corners of what lies of hulls between two heights, by the ends of their edges."""
+    first, last = ends.reshape(-1, 2, 3).swapaxes(0, 1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = (np.array([[low], [high]]) - first[:, 2]) / (last - first)[:, 2]
+    points = first + np.nan_to_num(np.clip(share, 0.0, 1.0))[..., None] * (last - first)
+    return points[(points[..., 2] >= low - 1e-9) & (points[..., 2] <= high + 1e-9)]
+
+
+def _one_gap(robot: RobotDescription, data: Any, turn: Array, low: float, high: float = np.inf) -> float:
+    """Return the gap between a jaw and the fixed one, moving less fixed along y of a frame, in a slab of z [m]."""
+    sides = _fingers(robot, robot.model)
+    jaw, fixed = (_within(in_world(data, _edges(robot.mjcf, tuple(side))) @ turn, low, high)[:, 1] for side in sides)
+    if not len(jaw) or not len(fixed):
+        return -np.inf
+    # y may point from either one to the other
+    return float(max(jaw.min() - fixed.max(), fixed.min() - jaw.max()))
+
+
+def _one_jaw(robot: RobotDescription, sides: tuple[list[int], list[int]]) -> tuple[RobotDescription, ParallelJaw]:
+    """Measure a jaw that closes on a fixed one: its gap is that at the tips, half of it from the fixed face."""
+    model, gripper = robot.model, robot.gripper
+    assert gripper is not None
+    j = int(model.body_jntadr[sides[0][0]])
+    openings = np.linspace(0.0, 1.0, 41)
+    poses = [_kinematics(robot, model, s) for s in openings]
+    closed, axis = poses[0], poses[0].xaxis[j]
+    mount = closed.xmat[model.body(robot.end_effector).id].reshape(3, 3)
+
+    def points(data: Any, k: int) -> Array:
+        return in_world(data, _edges(robot.mjcf, tuple(sides[k])))
+
+    along = points(closed, 0).mean(0) - closed.xanchor[j]
+    along = mount.T @ (along - axis * (along @ axis))
+    k = int(np.abs(along).argmax())
+    z = mount[:, k] * np.sign(along[k])
+    z = (z - axis * (z @ axis)) / np.linalg.norm(z - axis * (z @ axis))
+    y = axis if model.jnt_type[j] == _SLIDE else np.cross(axis, z)
+    y = y * np.sign((points(poses[5], 0).mean(0) - points(closed, 0).mean(0)) @ y)
+    turn = np.column_stack([np.cross(y, z), y, z])
+    fixed = points(closed, 1) @ turn
+    tip = min(fixed[:, 2].max(), (points(closed, 0) @ turn)[:, 2].max())
+    gaps = np.array([_one_gap(robot, data, turn, tip - _JAW) for data in poses])
+    last = int(np.argmax(gaps))
+    if gaps[last] < _LEAST_OPENING:
+        raise ConfigError(
+            f"the jaw of {robot.name!r} opens {1e3 * max(gaps[last], 0.0):.0f} mm at its tip, between the hulls of "
+            f"what collides; tasks need {1e3 * _LEAST_OPENING:.0f} mm",
+            hint="give its links collision shapes that leave the space between the jaws free, such as boxes",
+        )
+    first = int(np.flatnonzero(gaps[: last + 1] <= 0.0)[-1]) if gaps[0] < 0.0 else 0
+    zero = (
+        np.interp(0.0, gaps[first : first + 2], openings[first : first + 2]) if gaps[first] < 0.0 else openings[first]
+    )
+    ends = np.array([gripper.closed, gripper.open])
+    ends = ends[0] + np.outer([zero, openings[last]], ends[1] - ends[0])
+    jaws = RobotGripper(joints=gripper.joints, closed=tuple(ends[0].tolist()), open=tuple(ends[1].tolist()))
+    at_usual = min(_USUAL, float(gaps[last]))
+    usual = poses[int(np.searchsorted(gaps[: last + 1], at_usual))]
+    moving = points(usual, 0) @ turn
+    tips = [_within(side, tip - _JAW, np.inf) for side in (moving, fixed)]
+    low, high = np.max([pad.min(0) for pad in tips], axis=0), np.min([pad.max(0) for pad in tips], axis=0)
+    depth = np.arange(_JAW, tip - float(closed.xanchor[j] @ z), 0.005)
+    free = [_one_gap(robot, usual, turn, tip - h - 0.0025, tip - h + 0.0025) > _DEEP * at_usual for h in depth]
+    middle = np.array([0.5 * (low[0] + high[0]), tips[1][:, 1].max(), tip - 0.5 * _JAW])
+    width = max(float(np.ptp(pad[:, 0])) for pad in tips)
+    beyond = max(moving[:, 2].max(), (points(closed, 0) @ turn)[:, 2].max(), fixed[:, 2].max()) - middle[2]
+    jaw = ParallelJaw(
+        opening=float(gaps[last]),
+        pad_width=max(float(high[0] - low[0]), _FACE),
+        pad_length=_JAW,
+        finger_width=width,
+        thickness=max(float(np.ptp(pad[:, 1])) for pad in tips),
+        tip=float(beyond),
+        reach=float(beyond - 0.5 * _JAW + (depth[free.index(False)] if False in free else depth[-1])),
+        palm=(0.5 * width, 0.5 * float(gaps[last])),
+        friction=float(model.geom_friction[[geom for side in sides for geom in colliding(model, side)], 0].mean()),
+        frame=_in_tool(robot, closed, turn, middle),
+        follow=0.5,
+    )
+    return replace(robot, gripper=jaws), jaw
+
+
+def _two_fingers(robot: RobotDescription, sides: tuple[list[int], list[int]]) -> ParallelJaw:
+    """Measure two fingers that move."""
+    model = robot.model
     hand = [model.body(name).id for name in robot.hand_links]
     hand = [link for link in hand if link not in sides[0] + sides[1]]
     closed, wide = (_kinematics(robot, model, opening) for opening in (0.0, 1.0))
@@ -146,7 +274,8 @@ def _measured(robot: RobotDescription) -> ParallelJaw:
     face = np.array([left[:, 1].min(), right[:, 1].max()])
     opening = float(face[0] - face[1])
     if moved[0] @ y <= 0.0 or moved[1] @ y >= 0.0 or opening <= 0.0:
-        raise ConfigError(f"the fingers of {robot.name!r} do not close on each other", hint=_HINT)
+        gap = f"open, the hulls of what collides are {1e3 * opening:.0f} mm apart"
+        raise ConfigError(f"the fingers of {robot.name!r} do not close on each other: {gap}", hint=_HINT)
     pads = [left[left[:, 1] < face[0] + _FACE], right[right[:, 1] > face[1] - _FACE]]
     low = np.max([pad.min(0) for pad in pads], axis=0)
     high = np.min([pad.max(0) for pad in pads], axis=0)
@@ -157,9 +286,6 @@ def _measured(robot: RobotDescription) -> ParallelJaw:
     beside = whole[whole[:, 2] >= min(low[2], high[2]) - 1e-9]
     base = base @ turn
     middle = np.array([0.5 * (low[0] + high[0]), 0.5 * (face[0] + face[1]), 0.5 * (low[2] + high[2])])
-    tool = Rotation.from_matrix(mount) * Rotation.from_quat(robot.tool[3:])
-    origin = wide.xpos[model.body(robot.end_effector).id] + mount @ np.array(robot.tool[:3])
-    place = tool.inv().apply(turn @ middle - origin)
     faces = [geom for side in sides for geom in colliding(model, side)]
     pad_width, pad_length = (max(float(high[j] - low[j]), _FACE) for j in (0, 2))
     return ParallelJaw(
@@ -172,8 +298,18 @@ def _measured(robot: RobotDescription) -> ParallelJaw:
         reach=float(tips - base[:, 2].max()),
         palm=(max(0.5 * float(np.ptp(base[:, 0])), 0.01), max(0.5 * float(np.ptp(base[:, 1])), 0.01)),
         friction=float(model.geom_friction[faces, 0].mean()),
-        frame=(*place.tolist(), *(tool.inv() * Rotation.from_matrix(turn)).as_quat().tolist()),
+        frame=_in_tool(robot, wide, turn, middle),
     )
+
+
+def _in_tool(robot: RobotDescription, data: Any, turn: Array, middle: Array) -> ToolPose:
+    """Return the pose of a frame in that of the tool, by its axes in the world and its origin along them [m]."""
+    link = robot.model.body(robot.end_effector).id
+    mount = data.xmat[link].reshape(3, 3)
+    tool = Rotation.from_matrix(mount) * Rotation.from_quat(robot.tool[3:])
+    x, y, z = tool.inv().apply(turn @ middle - data.xpos[link] - mount @ np.array(robot.tool[:3]))
+    a, b, c, d = (tool.inv() * Rotation.from_matrix(turn)).as_quat()
+    return (float(x), float(y), float(z), float(a), float(b), float(c), float(d))
 
 
 def _pad_corners(model: Any, data: Any, side: list[int], out: Array) -> Array:
@@ -192,7 +328,7 @@ def _pad_corners(model: Any, data: Any, side: list[int], out: Array) -> Array:
     return np.concatenate(near) if near else np.empty((0, 3))
 
 
-_HINT = "give ParallelJaw(opening=..., ...) yourself; tasks need two fingers that both move"
+_HINT = "give ParallelJaw(opening=..., ...) yourself; tasks need two fingers, or one that closes on a fixed one"
 
 
 def _fingers(robot: RobotDescription, model: Any) -> tuple[list[int], list[int]]:
@@ -209,9 +345,11 @@ def _fingers(robot: RobotDescription, model: Any) -> tuple[list[int], list[int]]
     leaders = {tie.joint: tie.leader for tie in robot.ties}
     if len(sides) > 2 and len({leaders.get(name, name) for name in joints}) == 1:
         sides = opposed(_kinematics(robot, model, 0.0), _kinematics(robot, model, 1.0), sides)
+    if len(sides) == 1:  # what is fixed to the palm is the other finger
+        rigid = model.body_weldid == model.body_weldid[model.body_parentid[roots[0]]]
+        sides.append({b for b in range(1, model.nbody) if rigid[b]})
     if len(sides) != 2:
-        fixed = " (one that moves against a jaw that does not)" if len(roots) == 1 else ""
-        raise ConfigError(f"robot {robot.name!r} has {len(roots)} driven fingers{fixed}, not two", hint=_HINT)
+        raise ConfigError(f"robot {robot.name!r} has {len(roots)} driven fingers, not two", hint=_HINT)
     first, second = (sorted(side) for side in sides)
     return first, second
 

@@ -26,8 +26,9 @@ from softmode.foreign.child.model import check_parts, open_spec
 from softmode.foreign.tokens import SUFFIXES
 from softmode.robots.assets import RobotAsset, find, names_file
 from softmode.robots.compiled import CompiledRobot
+from softmode.robots.convex_parts import cut_meshes
 from softmode.robots.description import JointTie, RobotDescription
-from softmode.robots.hand import colliding, find_end_effector
+from softmode.robots.hand import branch, colliding, find_end_effector
 from softmode.robots.joint_split import hold_base, split_links
 from softmode.robots.meshes import use_meshes
 from softmode.robots.references import check_references, default_root, read_xml
@@ -122,13 +123,20 @@ def load(
     link, tool = robot.tool(end_effector, np.array(offset), drives)
     jaws, palm = robot.gripper(gripper, drives, start, link)
     behind = sorted({*robot.behind(palm), *robot.behind(link)})
-    robot.notes += _let_touch(spec, robot, behind)
+    changed = _let_touch(spec, robot, behind)
+    if (
+        jaws is not None
+        and len({branch(robot.model, palm, robot.joint_names.index(name)) for name in jaws.joints}) == 1
+    ):
+        rigid = np.flatnonzero(robot.model.body_weldid == robot.model.body_weldid[palm]).tolist()
+        changed += cut_meshes(spec, robot.model, colliding(robot.model, sorted({*behind, *rigid} - {0})))
     for equality in list(spec.equalities):
         if equality.name in robot.dropped:
             spec.delete(equality)
     for actuator in list(spec.actuators):
         spec.delete(actuator)
-    final = _compile(spec, asset)
+    robot.notes += changed
+    final = _compile(spec, asset) if changed else robot.model
     return RobotDescription(
         name=asset.name,
         path=asset.path,
@@ -329,6 +337,10 @@ def _keep_robot(spec: Any, root: str | None, asset: RobotAsset) -> list[str]:
         raise ConfigError(
             f"robot file {asset.path} {what}", hint=f"pass root= one of {names}" if tops else "give it a <body>"
         )
+    for joint in spec.joints:
+        if joint.range[0] > joint.range[1]:
+            text = f"has its lower limit {joint.range[0]:g} above the upper one {joint.range[1]:g}"
+            raise AssetError(f"robot file {asset.path}: joint {joint.name!r} {text}", hint="exchange them")
     left = [body.name or "a body without a name" for body in tops if body is not chosen[0]]
     left += [f"{len(spec.worldbody.geoms)} shapes of the world"] if spec.worldbody.geoms else []
     notes = [f"left out beside the robot: {', '.join(left)}"] if left else []

@@ -24,6 +24,8 @@ _MARK_LIMIT = 500_000
 """Most elements and attributes of a robot file and all that it includes: each takes a hundred bytes and more."""
 _MOST = dict.fromkeys(("key", "body", "link"), MAX_PARTS) | dict.fromkeys(("joint", "geom", "site"), MAX_SHAPES)
 """Most elements of a kind, of which MuJoCo takes seconds for some ten thousands."""
+_UNBOUND = 27
+"""Expat's number of a prefix that nothing declares."""
 _DEPTH_LIMIT = 1000
 _REFERENCE_LIMIT = 4096
 """Most references to files."""
@@ -67,7 +69,13 @@ def _parse(path: Path, left: int) -> tuple[ElementTree.Element, int]:
         hint = f"at most {_MARK_LIMIT} elements and attributes are read, of all files together"
         raise AssetError(f"robot file {path} has too many elements", hint=hint)
     try:
-        tree = ElementTree.fromstring(data)
+        try:
+            tree = ElementTree.fromstring(data)
+        except ElementTree.ParseError as error:
+            if error.code != _UNBOUND or path.suffix.lower() != ".urdf":  # MuJoCo reads an MJCF itself
+                raise
+            # Attributes of other programs, such as drake:acceleration, whose prefix nothing declares.
+            tree = ElementTree.fromstring(re.sub(rb"([\s</])(\w+):(\w[\w.-]*\s*[=\s/>])", rb"\1\2.\3", data))
     except (ElementTree.ParseError, ValueError) as error:
         line = error.position[0] if isinstance(error, ElementTree.ParseError) else 1
         raise AssetError(f"robot file {path}, line {line}: {error}", hint="mend the XML at that line") from error

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from softmode.deformables.model.structs import filled
 from softmode.robots import robot_control_kernels as kernels
 from softmode.robots.arm import ArmDescription, ArmIndices
+from softmode.robots.chain import serial_chain
 from softmode.robots.control import ArmController, ArmControlOptions, Controller
 from softmode.robots.description import RobotIndices
 from softmode.robots.table_robot import TableRobot, base_pose
@@ -67,6 +68,7 @@ class RobotController(Controller):
             ratio=array(chain.ratio),
             offset=array(chain.offset),
             tool=_tool_at_zero(self.table_robot),
+            follow=self.table_robot.jaw.follow,
             coord_start=self.coord_start,
             joint=self.joint_columns,
             finger=array([robot.joint_names.index(name) for name in fingers.joints], wp.int32),
@@ -90,8 +92,8 @@ def controller_of(
 
 
 def _tool_at_zero(table_robot: TableRobot) -> wp.transform:
-    """Return the tool in the world at zero coordinates."""
-    chain, base = table_robot.chain, base_pose(table_robot.base)
+    """Return the tool in the world at zero coordinates, with the fingers closed."""
+    chain, base = serial_chain(table_robot.robot, table_robot.jaw.frame), base_pose(table_robot.base)
     turn = Rotation.from_quat(base[3:])
     position = turn.apply(chain.tool_position) + base[:3]
     rotation = (turn * Rotation.from_matrix(chain.tool_rotation)).as_quat()

@@ -42,7 +42,8 @@ class RobotChain:
     leader: wp.array[int]  # (count,) the joint of the chain that each one follows, itself for most
     ratio: wp.array[float]
     offset: wp.array[float]
-    tool: wp.transform  # at zero coordinates
+    tool: wp.transform  # at zero coordinates, with the fingers closed
+    follow: float  # share of the gap by which it moves along y
     coord_start: wp.array[int]  # (world_count,)
     joint: wp.array[int]  # (count,) coordinate in the robot
     finger: wp.array[int]  # coordinates of the gripper's joints
@@ -52,7 +53,13 @@ class RobotChain:
 
 
 @wp.func
-def _forward(chain: RobotChain, q: vec8):
+def _tool_at(chain: RobotChain, gap: float):
+    """Return the tool at zero coordinates where the fingers are so far apart [m]."""
+    return chain.tool * wp.transform(wp.vec3(0.0, chain.follow * gap, 0.0), wp.quat_identity())
+
+
+@wp.func
+def _forward(chain: RobotChain, q: vec8, tool: wp.transform):
     """Return the tool's pose in the world at joint coordinates q."""
     pose = wp.transform_identity()
     for k in range(chain.count):
@@ -63,13 +70,13 @@ def _forward(chain: RobotChain, q: vec8):
             turn = wp.quat_from_axis_angle(axis, q[k])
             anchor = chain.anchor[k]
             pose = pose * wp.transform(anchor - wp.quat_rotate(turn, anchor), turn)
-    return pose * chain.tool
+    return pose * tool
 
 
 @wp.func
-def _jacobian(chain: RobotChain, q: vec8, rotation_weight: float):
+def _jacobian(chain: RobotChain, q: vec8, tool_at_zero: wp.transform, rotation_weight: float):
     """Return d(tool position, rotation_weight * rotation)/dq in the world frame; columns of no joint are zero."""
-    tool = wp.transform_get_translation(_forward(chain, q))
+    tool = wp.transform_get_translation(_forward(chain, q, tool_at_zero))
     jacobian = mat68()
     pose = wp.transform_identity()
     for k in range(chain.count):
@@ -101,7 +108,14 @@ def _followed(chain: RobotChain, q: vec8):
 
 @wp.func
 def _inverse(
-    chain: RobotChain, settings: Settings, position: wp.vec3, rotation: wp.quat, q_start: vec8, low: vec8, high: vec8
+    chain: RobotChain,
+    settings: Settings,
+    tool: wp.transform,
+    position: wp.vec3,
+    rotation: wp.quat,
+    q_start: vec8,
+    low: vec8,
+    high: vec8,
 ):
     """Iterate damped least squares towards a tool pose, within joint limits, pulled home in the null space.
 
@@ -111,10 +125,10 @@ def _inverse(
     q = q_start
     gain = wp.where(chain.count > 6, settings.posture_gain, 0.0)
     for _iteration in range(settings.iterations):
-        pose = _forward(chain, q)
+        pose = _forward(chain, q, tool)
         e_position = position - wp.transform_get_translation(pose)
         e_rotation = settings.rotation_weight * _rotation_between(rotation, wp.transform_get_rotation(pose))
-        jacobian = _jacobian(chain, q, settings.rotation_weight)
+        jacobian = _jacobian(chain, q, tool, settings.rotation_weight)
         for k in range(chain.count):
             if chain.leader[k] != k:
                 for i in range(6):
@@ -138,9 +152,9 @@ def _inverse(
 
 
 @wp.func
-def _outside(chain: RobotChain, settings: Settings, q: vec8):
+def _outside(chain: RobotChain, settings: Settings, tool: wp.transform, q: vec8):
     """Return the distance of the tool from the workspace box [m]."""
-    position = wp.transform_get_translation(_forward(chain, q))
+    position = wp.transform_get_translation(_forward(chain, q, tool))
     return wp.length(position - _clamp_into(position, settings.workspace_lower, settings.workspace_upper))
 
 
@@ -194,8 +208,8 @@ def reset_command(
     if not world_mask[world]:
         return
     q = _read_arm(chain, world, joint_q_in)
-    pose = _forward(chain, q)
     opening = _read_opening(chain, world, joint_q_in)
+    pose = _forward(chain, q, _tool_at(chain, opening))
     for k in range(chain.count + 2):
         value = 0.5 * opening
         if k < chain.count:
@@ -220,8 +234,13 @@ def move_command(
     """Apply one action to the command: move, clamp to workspace and lead, solve for the joints, move the gripper."""
     world = wp.tid()
     measured = _read_arm(chain, world, joint_q_in)
-    measured_pose = _forward(chain, measured)
+    measured_opening = _read_opening(chain, world, joint_q_in)
+    measured_pose = _forward(chain, measured, _tool_at(chain, measured_opening))
     command.tool_pose[world] = measured_pose
+    command.opening[world] = measured_opening
+    opening = command.commanded_q[world, chain.count] + command.commanded_q[world, chain.count + 1]
+    opening = moved_opening(settings, opening, measured_opening, _clean(action[world, action.shape[1] - 1]))
+    tool = _tool_at(chain, opening)
     q = vec8()
     low = vec8()
     high = vec8()
@@ -238,14 +257,14 @@ def move_command(
             moved = q[k] + settings.joint_scale * _clean(action[world, k])
             q[k] = wp.clamp(wp.clamp(moved, measured[k] - lead, measured[k] + lead), low[k], high[k])
         q = _followed(chain, q)
-        pose = _forward(chain, q)
+        pose = _forward(chain, q, tool)
         position = wp.transform_get_translation(pose)
         inside = _clamp_into(position, settings.workspace_lower, settings.workspace_upper)
         if wp.length(inside - position) > 0.0:
-            q = _inverse(chain, settings, inside, wp.transform_get_rotation(pose), q, low, high)
-            if _outside(chain, settings, q) > wp.max(_outside(chain, settings, q_before), 1.0e-3):
+            q = _inverse(chain, settings, tool, inside, wp.transform_get_rotation(pose), q, low, high)
+            if _outside(chain, settings, tool, q) > wp.max(_outside(chain, settings, tool, q_before), 1.0e-3):
                 q = q_before
-            pose = _forward(chain, q)
+            pose = _forward(chain, q, tool)
             position = wp.transform_get_translation(pose)
         command.target_position[world] = position
         command.target_yaw[world] = _tool_yaw(wp.transform_get_rotation(pose))
@@ -254,17 +273,13 @@ def move_command(
         before, before_yaw = command.target_position[world], command.target_yaw[world]
         entry = _clean(action[world, 3])
         position, yaw = held_target(settings, before, before_yaw, measured_pose, move, entry)
-        q = _inverse(chain, settings, position, down_at(yaw), q, low, high)
-        position, yaw = attained_target(position, yaw, _forward(chain, q))
+        q = _inverse(chain, settings, tool, position, down_at(yaw), q, low, high)
+        position, yaw = attained_target(position, yaw, _forward(chain, q, tool))
         command.target_position[world] = position
         command.target_yaw[world] = yaw
 
     for k in range(chain.count):
         command.commanded_q[world, k] = q[k]
-    measured_opening = _read_opening(chain, world, joint_q_in)
-    command.opening[world] = measured_opening
-    opening = command.commanded_q[world, chain.count] + command.commanded_q[world, chain.count + 1]
-    opening = moved_opening(settings, opening, measured_opening, _clean(action[world, action.shape[1] - 1]))
     command.commanded_q[world, chain.count] = 0.5 * opening
     command.commanded_q[world, chain.count + 1] = 0.5 * opening
 
@@ -300,5 +315,6 @@ def measure(
 ):
     """Compute the tool's pose and the distance between the fingers."""
     world = wp.tid()
-    command.tool_pose[world] = _forward(chain, _read_arm(chain, world, joint_q_in))
-    command.opening[world] = _read_opening(chain, world, joint_q_in)
+    opening = _read_opening(chain, world, joint_q_in)
+    command.tool_pose[world] = _forward(chain, _read_arm(chain, world, joint_q_in), _tool_at(chain, opening))
+    command.opening[world] = opening

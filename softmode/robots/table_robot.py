@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -19,7 +20,7 @@ from softmode.robots.arm import ArmDescription, ArmIndices, GripperDescription
 from softmode.robots.chain import SerialChain, serial_chain
 from softmode.robots.description import RobotDescription, RobotIndices
 from softmode.robots.hand import settled
-from softmode.robots.jaws import ParallelJaw, dry_friction_of, finger_names, gap_of
+from softmode.robots.jaws import ParallelJaw, dry_friction_of, finger_names, gap_of, measured
 
 Array = NDArray[np.float64]
 
@@ -37,6 +38,12 @@ _SHARES = (1.0, 0.75, 0.5, 0.3)
 """Shares of the ranges that are tried in turn."""
 _HEIGHTS = (0.0, 0.15, 0.3, 0.45)
 """How high above the table the base is tried, in turn [m]."""
+_POSES = 4000
+"""Most poses that a search for a base tries: about 2 s on a laptop."""
+_FIRST = 25
+"""Steps of the inverse kinematics after which a pose is given up that is farther off than `_HOPE`."""
+_HOPE = 0.03
+"""See `_FIRST` [m]."""
 _FREE = 5.7
 """Range of an upright first joint from which on the base needs not be turned [rad]."""
 _LOW = 0.13
@@ -45,8 +52,18 @@ _BENT = ((0.0, -1.0, 1.0, -1.0, -1.0, 0.0), (0.0, -1.0, -1.0, 1.0, 1.0, 0.0), (0
 """Poses in which the search begins, in quarters of the ranges of the joints: shoulder, elbow and wrist bent."""
 _ROOM = 0.1
 """How far every joint of the home pose should be from the ends of its range [rad]."""
+_STEP = 0.01
+"""A step of the simulation, in which a drive must not swing [s]."""
 _STUCK = 0.5e-3
 """How far dry friction of its joints may hold a finger from where its drive aims [m]."""
+
+
+@dataclass
+class _Search:
+    """What a search may still do: its work is bounded, not its time, so that all machines find the same."""
+
+    left: int = field(default_factory=lambda: _POSES)
+    """Poses to be tried yet."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,8 +111,8 @@ class TableRobot:
 
     @property
     def chain(self) -> SerialChain:
-        """The chain to the frame of tasks, in the base frame."""
-        return serial_chain(self.robot, self.jaw.frame)
+        """The chain to the frame of tasks, in the base frame, with the opening of the home pose."""
+        return serial_chain(self.robot, self.jaw.frame_at(self.home_opening))
 
     @property
     def joint_count(self) -> int:
@@ -142,15 +159,24 @@ class TableRobot:
         Raises:
             ConfigError: If the point is out of reach.
         """
-        chain = self.chain
-        start = np.array(self.robot.home)[list(chain.joints)]
-        q, error = _reach(chain, np.array([self.base]), np.array([position], float), np.array([yaw]), start)
+        q, error = self._held(np.array([position], float), yaw)
         if error[0] > _NEAR:
             raise ConfigError(
                 f"robot {self.robot.name!r} cannot hold its tool at {tuple(position)} m pointing down with yaw {yaw}",
                 hint="choose a point nearer to its base, or place it anew: softmode.robots.place_robot(robot, ...)",
             )
         return q[0]
+
+    def turn_at(self, positions: Array, yaw: float) -> float | None:
+        """Return a yaw, or the one half a turn away, with which the tool gets to points (N, 3) [m]; None if neither."""
+        turns = (yaw, yaw - math.copysign(math.pi, yaw))
+        return next((turn for turn in turns if (self._held(positions, turn)[1] <= _NEAR).all()), None)
+
+    def _held(self, positions: Array, yaw: float) -> tuple[Array, Array]:
+        """Return coordinates that hold the tool at points, pointing down with a yaw, and what is missing [m]."""
+        chain = self.chain
+        start = np.array(self.robot.home)[list(chain.joints)]
+        return _reach(chain, np.array([self.base]), positions, np.full(len(positions), yaw), start, _Search())
 
     def add_to(
         self, builder: newton.ModelBuilder, *, xform: Sequence[float] | None = None, label: str = "arm"
@@ -237,12 +263,13 @@ def place_robot(
             f"robot {robot.name!r} has no gripper, which this task needs",
             hint="name its joints: load(..., gripper={'joint': (closed, open)}), or give it a hand: load(..., hand=)",
         )
-    jaw = ParallelJaw.of(robot)
-    chain = serial_chain(robot, jaw.frame)
+    robot, jaw = measured(robot)
+    home_opening = min(home_opening, jaw.opening)
+    chain = serial_chain(robot, jaw.frame_at(home_opening))
     if not 5 <= len(chain.joints) <= JOINT_MAX:
         raise ConfigError(
             f"robot {robot.name!r} has {len(chain.joints)} joints between base and tool, expected 5 to {JOINT_MAX}",
-            hint="write control.joint_target_q yourself, see RobotDescription.with_opening",
+            hint="hold a base that floats (floating=False), or write control.joint_target_q yourself (with_opening)",
         )
     loose = [robot.joint_names[j] for j in chain.joints if robot.drives[j] is None]
     if loose:
@@ -253,34 +280,34 @@ def place_robot(
     # The fingers may change sides: half a turn about the tool, which may free the last joint's range.
     half = Rotation.from_quat(jaw.frame[3:]) * Rotation.from_rotvec([0.0, 0.0, np.pi])
     other = (*jaw.frame[:3], *half.as_quat().tolist())
-    jaws = [jaw, replace(jaw, frame=other)]
+    jaws = [jaw, replace(jaw, frame=other, follow=-jaw.follow)]
     bases = [[tuple(map(float, base))]] if base is not None else [_bases(chain, over, up) for up in _HEIGHTS]
-    best: tuple[float, ParallelJaw, Any, Array] | None = None
-    home = np.array(home_position, float)
-    for share in _SHARES:
+    best: tuple[float, ParallelJaw, Any, Array, list[float]] | None = None
+    search = _Search()
+    for share, every in itertools.product(_SHARES, bases):
+        home = np.array(home_position, float)
         if share < 1.0:
             home[2] = max(share * home_position[2], min(home_position[2], _LOW))
         box = np.stack(np.meshgrid([-1.0, 1.0], [-1.0, 1.0], [0.02, max(share * height, home[2])], indexing="ij"), -1)
         places = box.reshape(-1, 3) * [share * ranges[0], share * ranges[1], 1.0] + [*over, 0.0]
-        points = np.concatenate([np.array([home] * 3), places, np.reshape(np.array(also, float), (-1, 3))])
-        yaw = np.array([0.0, _YAW, -_YAW] + [0.0] * (len(points) - 3))
-        for some in bases:
-            found = [_placed(robot, one, some, points, yaw) for one in jaws]
-            found = [one for one in found if one is not None]
-            if found:
-                _, chosen, placed, q = min(found, key=lambda one: one[0])
-                best = share, chosen, placed, q
-                break
-        if best is not None:
+        points = np.concatenate([home[None], places, np.reshape(np.array(also, float), (-1, 3))])
+        far = np.linalg.norm(points[:, None] - _shoulders(chain, every), axis=2).max(axis=0)
+        some = [one for one, distance in zip(every, far, strict=True) if distance < chain.reach + _NEAR]
+        found = [_placed(robot, one, home_opening, some, points, search) for one in jaws]
+        found = [one for one in found if one is not None]
+        if found:
+            _, chosen, placed, q = min(found, key=lambda one: one[0])
+            best = share, chosen, placed, q, home.tolist()
+        if found or search.left <= 0:
             break
     if best is None:
+        spent = f", in the {_POSES} poses that are tried" if search.left <= 0 else ""
         raise ConfigError(
             f"robot {robot.name!r}, whose tool reaches {chain.reach:.2f} m, finds no place from which it points down "
-            f"at {tuple(home_position)} m and around {tuple(over)} m",
+            f"at {tuple(home_position)} m, turned by {_YAW} rad to either side, and around {tuple(over)} m{spent}",
             hint="use a larger robot, a lower home_position, or name its tool: load(..., end_effector=, tool_offset=)",
         )
-    share, jaw, placed, q = best
-    home_position = home.tolist()
+    share, jaw, placed, q, home_position = best
     gaps = np.maximum.accumulate([gap_of(robot, jaw, s) for s in np.linspace(0.0, 1.0, _OPENINGS)])
     gaps = np.maximum(gaps, 0.0) + 1.0e-7 * np.arange(_OPENINGS)  # ascending
     jaw = replace(jaw, opening=float(gaps[-1]))
@@ -292,7 +319,7 @@ def place_robot(
     robot = replace(robot, home=tuple(home.tolist()))
     travel = 0.5 * float(gaps[-1] - gaps[0])
     friction = 0.5 * dry_friction_of(robot) / travel
-    robot, force, stiffness = _with_grip(robot, travel, friction, grip_force, grip_way)
+    robot, force, stiffness = _with_grip(_steady(robot), travel, friction, grip_force, grip_way)
     return TableRobot(
         robot=robot,
         base=placed,
@@ -338,7 +365,8 @@ def _with_grip(
     if way is not None:
         wanted = max(force / way, friction / _STUCK) * lever**2 / shared
         inertia = robot.joint_inertias()[index]
-        critical = 2.0 * np.sqrt(np.maximum(wanted, stiffness) * inertia)
+        # A finger that weighs little swings within a step of the simulation unless it is damped more.
+        critical = np.maximum(2.0 * np.sqrt(np.maximum(wanted, stiffness) * inertia), _STEP * wanted)
         damping = np.where(wanted > stiffness, np.maximum(damping, critical), damping)
         stiffness = np.maximum(stiffness, wanted)
     changed = list(robot.drives)
@@ -350,26 +378,51 @@ def _with_grip(
     return replace(robot, drives=tuple(changed)), force, along
 
 
+def _steady(robot: RobotDescription) -> RobotDescription:
+    """Return the robot with softer drives where they would swing within a step of the simulation."""
+    drives = list(robot.drives)
+    for j, (drive, inertia, loss) in enumerate(
+        zip(drives, robot.joint_inertias(), robot.model.dof_damping.tolist(), strict=True)
+    ):
+        fast = drive is not None and drive.stiffness * _STEP**2 > inertia
+        if drive is not None and fast and drive.damping + loss < drive.stiffness * _STEP:
+            stiffness = 0.25 * float(inertia) / _STEP**2
+            drives[j] = replace(drive, stiffness=stiffness, damping=stiffness * _STEP)
+    return replace(robot, drives=tuple(drives))
+
+
 def _placed(
-    robot: RobotDescription, jaw: ParallelJaw, bases: list[Any], points: Array, yaw: Array
+    robot: RobotDescription,
+    jaw: ParallelJaw,
+    opening: float,
+    bases: list[Any],
+    points: Array,
+    search: _Search,
 ) -> tuple[float, ParallelJaw, Any, Array] | None:
     """Return how far from home, the jaw, the base, and the coordinates over the first point; None if none reaches all.
 
     The middle of the distances that serve is taken, in the direction that asks for the least change of the home pose
     and leaves the last joint room to turn the tool.
     """
-    chain = serial_chain(robot, jaw.frame)
-    at_home, error = _reach(chain, np.array(bases), np.tile(points[0], (len(bases), 1)), yaw[:1], chain.home, bent=True)
+    if not bases:
+        return None
+    chain = serial_chain(robot, jaw.frame_at(opening))
+    places, over_home = np.array(bases), np.tile(points[0], (len(bases), 1))
+    at_home, error = _reach(chain, places, over_home, np.zeros(1), chain.home, search, bent=True)
     reached = error <= _NEAR
-    for some in (slice(3, None), slice(1, 3)):  # the places are what most bases do not reach
+    # Opposite corners are what most bases do not reach. Turned by half a turn, the fingers change sides.
+    sides = [(points[:1], (turn, turn - math.copysign(math.pi, turn))) for turn in (_YAW, -_YAW)]
+    for some, turns in ((points[[1, 6]], (0.0,)), (points[1:], (0.0,)), *sides):
         left = np.flatnonzero(reached)
-        if not len(left):
-            return None
-        count = len(points[some])
-        rows, turns = np.tile(points[some], (len(left), 1)), np.tile(yaw[some], len(left))
-        starts = np.repeat(at_home[left], count, axis=0)
-        _, error = _reach(chain, np.repeat(np.array(bases)[left], count, axis=0), rows, turns, starts)
-        reached[left] = (error.reshape(-1, count) <= _NEAR).all(axis=1)
+        reached[left] = False
+        for turn in turns:
+            left = left[~reached[left]]
+            if not len(left):
+                break
+            base, start = (np.repeat(rows[left], len(some), axis=0) for rows in (places, at_home))
+            rows = np.tile(some, (len(left), 1))
+            _, error = _reach(chain, base, rows, np.full(len(rows), turn), start, search)
+            reached[left] = (error.reshape(-1, len(some)) <= _NEAR).all(axis=1)
     middles = []
     for turn in dict.fromkeys(one[3] for one in bases):
         chosen = [k for k in np.flatnonzero(reached) if bases[k][3] == turn]
@@ -387,16 +440,24 @@ def _bases(chain: SerialChain, over: Sequence[float], up: float) -> list[Any]:
     """Return places of the base: at a height, at several distances on the near side, turned by quarter turns."""
     low, high = chain.span
     # The first joint of most arms turns the base by itself.
-    free = abs(chain.axis[0, 2]) > 0.99 and not chain.slide[0] and high[0] - low[0] > _FREE
+    upright = abs(chain.axis[0, 2]) > 0.99 and not chain.slide[0]
+    free = upright and high[0] - low[0] > _FREE
+    turns = (0.0,) if free else (0.0, 0.5 * math.pi, -0.5 * math.pi, math.pi)
+    aside = _about_z(np.array(turns)).apply(chain.anchor[0] if upright else np.zeros(3))  # from the base to its axis
     return [
-        (float(over[0] - share * chain.reach), float(over[1]), up, turn)
-        for turn in ((0.0,) if free else (0.0, 0.5 * math.pi, -0.5 * math.pi, math.pi))
+        (float(over[0] - share * chain.reach - x), float(over[1] - y), up, turn)
+        for turn, (x, y, _) in zip(turns, aside, strict=True)
         for share in np.linspace(0.25, 0.95, 15)
     ]
 
 
+def _shoulders(chain: SerialChain, bases: list[Any]) -> Array:
+    """Return where the first joint is with the base at places, shape (N, 3) [m]."""
+    return np.array([one[:3] for one in bases]) + _about_z(np.array(bases)[:, 3]).apply(chain.anchor[0])
+
+
 def _reach(
-    chain: SerialChain, base: Array, points: Array, yaw: Array, start: Array, *, bent: bool = False
+    chain: SerialChain, base: Array, points: Array, yaw: Array, start: Array, search: _Search, *, bent: bool = False
 ) -> tuple[Array, Array]:
     """Return coordinates that hold the tool at points of the world, pointing down, and what is missing [m].
 
@@ -409,6 +470,7 @@ def _reach(
         points: The points, shape (N, 3).
         yaw: Rotation of the tool about the vertical there [rad], shape (N,).
         start: The home pose, shape (n,) or (N, n).
+        search: What may still be tried.
         bent: Whether more poses are tried: with the elbow up, down and to the sides.
     """
     base, yaw = np.broadcast_to(base, (len(points), 4)), np.broadcast_to(yaw, len(points))
@@ -422,7 +484,10 @@ def _reach(
         starts += [middle + quarter * np.resize(signs, len(low)) for signs in _BENT]
 
     def solved(rows: NDArray[np.int64], begin: Array) -> tuple[Array, Array]:
-        q, error = chain.inverse(local[rows], turns[rows], begin, iterations=80)
+        search.left -= len(rows)
+        q, error = chain.inverse(local[rows], turns[rows], begin, iterations=_FIRST)
+        near = np.flatnonzero(error < _HOPE)  # what is far off by then stays there
+        q[near], error[near] = chain.inverse(local[rows[near]], turns[rows[near]], q[near], iterations=80 - _FIRST)
         return q, np.where(chain.lowest(q) + base[rows, 2] < 0.0, np.inf, error)
 
     def ranked(q: Array, error: Array) -> Array:
@@ -433,7 +498,7 @@ def _reach(
     for other in starts:
         rank = ranked(q, error)
         left = np.flatnonzero(rank > _NEAR)
-        if not len(left):
+        if not len(left) or search.left <= 0:
             break
         again, missing = solved(left, other)
         better = ranked(again, missing) < rank[left]

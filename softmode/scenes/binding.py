@@ -75,8 +75,8 @@ class BoundSplats:
         worlds: Which worlds; all of them if None. Without a model: which states, the first if None.
         others: Splats behind those of the objects, which `update` leaves where they are: a marker, rigid toys; a list
             with one per world of the model where worlds differ.
-        resident: Objects of which every soft body of a world may become any, see `choose`; lists in `others` then have
-            one Splats per resident, and follow the first.
+        choices: Objects of which every soft body of a world may become any, see `choose`; lists in `others` then have
+            one Splats per choice, and follow the first.
         choice: Which of them each world has, int32, shape (world_count,), or (world_count, objects), -1 for none.
         sh_degree: Highest degree of the colours, 0 to 3; None for that of the splats.
         device: Warp device where there is no model.
@@ -92,14 +92,14 @@ class BoundSplats:
         *,
         worlds: Sequence[int] | None = None,
         others: Sequence[Splats | Sequence[Splats]] = (),
-        resident: Sequence[SoftObject] = (),
+        choices: Sequence[SoftObject] = (),
         choice: wp.array | None = None,
         sh_degree: int | None = None,
         device: wp.DeviceLike = None,
     ) -> None:
         """Upload the splats at rest."""
         self._choice: Any = None if choice is None else choice.flatten()  # the same memory
-        self._resident = tuple(resident)
+        self._choices = tuple(choices)
         device = device if model is None else model.device
         each = [[thing] if thing is None or isinstance(thing, SoftObject) else list(thing) for thing in objects]
         self.indices = tuple(o for o, things in enumerate(each) if _has_splats(things))
@@ -112,26 +112,27 @@ class BoundSplats:
         else:
             raise ConfigError(f"there are {len(objects)} objects and no model", hint="give one object that has splats")
         chosen = range(len(starts)) if worlds is None else worlds
-        if self._resident:
-            chosen = range(len(self._resident))
+        if self._choices:
+            chosen = range(len(self._choices))
         for part in others:
             if not isinstance(part, Splats) and len(part) <= max(chosen):
                 hint = "give one Splats, or one for each world of the model"
                 raise ConfigError(f"others has {len(part)} splats for world {max(chosen)}", hint=hint)
         parts: list[Splats | list[Splats]] = []
         for things in [each[o] for o in self.indices]:
-            things = self._resident or things
+            things = self._choices or things
             splats = [thing.visible_splats for thing in things if thing is not None]
-            same = len(things) == 1 and not self._resident
+            same = len(things) == 1 and not self._choices
             parts.append(splats[0] if same else [splats[w] for w in chosen])
         parts += [part if isinstance(part, Splats) else [part[w] for w in chosen] for part in others]
-        count = len(self._resident) or len(starts)
+        count = len(self._choices) or len(starts)
         arrays = SplatArrays.from_splats(parts, world_count=count, sh_degree=sh_degree, device=device)
-        if self._resident and len(each) > 1:
+        if self._choices and len(each) > 1:
             widths = [max(part.count for part in splats) for splats in map(_listed, parts)]
             arrays = _one_row_each(arrays, count, widths)
-        self._table = arrays
-        self._slots = len(each) if self._resident else 1
+        self.table = arrays
+        """The splats at rest: of `choices` a row per choice, else `arrays`."""
+        self._slots = len(each) if self._choices else 1
         rows = None if choice is None else self._choice.numpy()[:: self._slots].astype(np.int32)
         self.arrays = arrays if rows is None else _rows_of(arrays, rows)
         """The splats as they are, for cameras and rasterisers."""
@@ -141,12 +142,12 @@ class BoundSplats:
         """Where the splats of each object that has some are in `arrays`, then those of `others`; where worlds differ,
         the last columns of a world may be empty."""
         self._skins: list[_Skin] = []
-        if self._resident:
+        if self._choices:
             places = [
                 {"start": _column(start, device), "samples": _column(first, device)}
                 for start, first in zip(starts.T, samples.T, strict=True)
             ]
-            for thing in self._resident:
+            for thing in self._choices:
                 skin = _skin(thing, device)
                 for place, columns in zip(places, self.columns, strict=False):
                     rows = wp.zeros(len(starts), dtype=int, device=device)
@@ -171,17 +172,13 @@ class BoundSplats:
             return
         slots, worlds = self._slots, world_mask.shape[0]
         widths = [columns.stop - columns.start for columns in self.columns[:slots]]
-        for table, array in self.per_object:
-            copy_slots(table, array, self._choice, world_mask, parts=widths if slots > 1 else None)
+        for name in _ARRAYS:
+            table, array = getattr(self.table, name), getattr(self.arrays, name)
+            if table is not array and table is not None:
+                copy_slots(table, array, self._choice, world_mask, parts=widths if slots > 1 else None)
         for n, one in enumerate(self._skins):
             k, slot = divmod(n, slots)
             launch(self._choice.device, kernels.rows_that_chose, worlds, self._choice, slots, slot, k, one.rows)
-
-    @property
-    def per_object(self) -> list[tuple[wp.array, wp.array]]:
-        """Arrays of a row per resident object, and those of a row per world that follow them."""
-        named = ((getattr(self._table, name), getattr(self.arrays, name)) for name in _ARRAYS)
-        return [(table, array) for table, array in named if table is not array and table is not None]
 
     def update(self, state: newton.State) -> None:
         """Move the splats to where a state of the model has them; capturable after a first time."""

@@ -10,6 +10,7 @@ import warp as wp
 from softmode.deformables.model.compile_ahead import compile_launches
 from softmode.errors import ConfigError
 from softmode.scenes.recording import Recording
+from softmode.stages import KERNELS, stage
 
 if TYPE_CHECKING:
     from softmode.scenes.scene import Scene
@@ -24,7 +25,8 @@ def capture_graph(launches: Callable[[], None], device: wp.DeviceLike) -> Record
         launches: Launches, without anything that reads from the device.
         device: Warp device.
     """
-    launches()
+    with stage(KERNELS):
+        launches()
     return Recording(launches, device)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -13,14 +14,16 @@ from numpy.typing import NDArray
 from softmode.scenes.host import host
 from softmode.scenes.meshes import SceneMesh, scene_meshes, scene_poses
 from softmode.splats.cameras.camera_options import CameraOptions
-from softmode.splats.cameras.mesh_raster import MeshRaster, TriangleMeshes
-from softmode.splats.raster.pinhole import PinholeCamera
+from softmode.splats.cameras.mesh_raster import FilmLook, MeshRaster, TriangleMeshes
+from softmode.splats.raster.pinhole import PinholeCamera, Vector
 from softmode.splats.raster.rasterizer import RasterizerOptions, SplatArrays, SplatRasterizer, ViewArrays
 from softmode.splats.splats import Splats, rotations_from_quats
 
 SEGMENTS = 48
 """Facets around a sphere, capsule, cylinder or cone."""
 
+TABLE = "world/table"
+"""Label of the shape that is shown as a table of wood."""
 MARKER_OPACITY = 0.6
 """Factor on the opacities of a marker's splats."""
 
@@ -38,6 +41,7 @@ class FilmCamera:
         marker: The splats that mark a place.
         cameras: The cameras, fixed in the world until `aim` moves one.
         options: Light and sky.
+        look: A second light, a table of wood and a room around all; None for none.
     """
 
     def __init__(
@@ -49,6 +53,7 @@ class FilmCamera:
         cameras: Sequence[PinholeCamera],
         *,
         options: CameraOptions | None = None,
+        look: FilmLook | None = None,
     ) -> None:
         """Upload the meshes and allocate the images."""
         self.cameras, self._objects, self._marker = tuple(cameras), objects, marker
@@ -59,10 +64,11 @@ class FilmCamera:
         self._matrices = np.stack([camera.world_to_camera for camera in per_world])
         width, height, views = cameras[0].width, cameras[0].height, len(per_world)
         size = (views, width, height)
-        meshes, starts, low, high = _triangles(model, state)
+        meshes, starts, low, high = _triangles(model, state, look)
         about = (0.5 * (low + high), 0.75 * float(np.linalg.norm(high - low)))
+        self._boxes, self._starts = _boxes(meshes), starts
         light = options if options is not None else CameraOptions()
-        self._meshes = MeshRaster(meshes, starts, *about, *size, light=light, device=device)
+        self._meshes = MeshRaster(meshes, starts, *about, *size, light=light, look=look, device=device)
         self._splats = SplatRasterizer(objects.means.shape[1], *size, device=device)
         self._marks = None if marker is None else SplatRasterizer(marker.means.shape[1], *size, device=device)
         self._plate: SplatRasterizer | None = None
@@ -71,6 +77,7 @@ class FilmCamera:
         self._mark_views = replace(self.views, splat_gain=gain)
         self._no_depth = wp.zeros((views, height, width), dtype=wp.float32, device=device)
         self._moved = True
+        self._ring: tuple[wp.array, wp.array, Vector] | None = None
         self.rgb = wp.zeros((views, height, width, 3), dtype=wp.uint8, device=device)
         """The pictures, shape (view_count, height, width, 3), overwritten by every frame."""
 
@@ -85,6 +92,28 @@ class FilmCamera:
         drawn = RasterizerOptions(median_depth=True)
         self._plate = SplatRasterizer(background.count, views, width, height, options=drawn, device=device)
         self._moved = True
+
+    def circle(self, places: NDArray[np.float64], radii: NDArray[np.float64], color: Vector) -> None:
+        """Draw a thin ring around a place of each world, in front of no object, in place of the marker's splats.
+
+        Args:
+            places: The places [m], shape (world_count, 3).
+            radii: Radii of the rings [m], shape (world_count,).
+            color: Their colour, sRGB.
+        """
+        if self._ring is None:
+            device, count = self.rgb.device, self._worlds
+            made = (wp.zeros(count, dtype=wp.vec3, device=device), wp.zeros(count, dtype=float, device=device))
+            self._ring = (*made, color)
+        for array, given in zip(self._ring[:2], (places, radii), strict=True):
+            array.assign(given.astype(np.float32))
+
+    def corners(self, state: newton.State) -> NDArray[np.float64]:
+        """Return the corners of the boxes around the meshes of all moving bodies [m], shape (world_count, K, 3)."""
+        poses = host(state.body_q).astype(np.float64)[self._starts[:, None] + np.array(list(self._boxes))]
+        turns = rotations_from_quats(poses[..., 3:].reshape(-1, 4)).reshape(*poses.shape[:2], 3, 3)
+        found = np.einsum("wbij,bkj->wbki", turns, np.stack(list(self._boxes.values()))) + poses[:, :, None, :3]
+        return found.reshape(self._worlds, -1, 3)
 
     def aim(self, name: str, matrices: NDArray[np.float64]) -> None:
         """Move a camera.
@@ -107,7 +136,9 @@ class FilmCamera:
         meshes = self._meshes
         meshes.render(state.body_q, self.views, self._objects, self._plate)
         rgb = meshes.rgb
-        if self._marker is not None and self._marks is not None:
+        if self._ring is not None:
+            meshes.circle(*self._ring, self.views)
+        elif self._marker is not None and self._marks is not None:
             self._marks.render(self._marker, self._mark_views, mesh_rgb=rgb, mesh_depth=self._no_depth)
             rgb = self._marks.rgb
         self._splats.render(self._objects, self.views, mesh_rgb=rgb, mesh_depth=meshes.depth)
@@ -122,8 +153,17 @@ def columns_of(arrays: SplatArrays, columns: slice) -> SplatArrays:
     return replace(arrays, **named, object_index=arrays.object_index[columns], rotations=turns, spanning=None)
 
 
+def _boxes(meshes: TriangleMeshes) -> dict[int, NDArray[np.float64]]:
+    """Return the corners of the box around what each moving body carries, in its frame [m], shape (8, 3), by body."""
+    found = {}
+    for body in np.unique(meshes.bodies[meshes.bodies >= 0]).tolist():
+        own = meshes.corners[meshes.bodies == body]
+        found[body] = np.array(list(itertools.product(*zip(own.min(axis=0), own.max(axis=0), strict=True))))
+    return found
+
+
 def _triangles(
-    model: newton.Model, state: newton.State
+    model: newton.Model, state: newton.State, look: FilmLook | None
 ) -> tuple[TriangleMeshes, NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]]:
     """Return the meshes of a world, the first body of each world, and the box of what moves, or else of all [m]."""
     worlds = max(int(model.world_count), 1)
@@ -139,14 +179,17 @@ def _triangles(
     box = [part for mesh, part in zip(meshes, moved, strict=True) if mesh.body >= 0] or moved or [np.zeros((1, 3))]
     bodies = [mesh.body - int(starts[0]) if mesh.body >= 0 else -1 for mesh in meshes]
     sizes = [len(mesh.faces) for mesh in meshes]
+    wooden = [look is not None and mesh.label == TABLE for mesh in meshes]
+    tints = [look.table if look is not None and wood else m.color for m, wood in zip(meshes, wooden, strict=True)]
     triangles = TriangleMeshes(
         corners=np.concatenate([empty, *(mesh.vertices for mesh in meshes)]),
         normals=np.concatenate([empty, *(mesh.normals for mesh in meshes)]),
         faces=np.concatenate([empty.astype(np.int32), *(m.faces + e for m, e in zip(meshes, ends, strict=False))]),
-        colors=np.repeat(np.array([mesh.color for mesh in meshes], np.float32).reshape(-1, 3), sizes, axis=0),
+        colors=np.repeat(np.array(tints, np.float32).reshape(-1, 3), sizes, axis=0),
         shapes=np.repeat(np.arange(len(meshes), dtype=np.int32), sizes),
         closed=np.repeat([_is_closed(mesh) for mesh in meshes], sizes),
         bodies=np.repeat(np.array(bodies, np.int32), [len(mesh.vertices) for mesh in meshes]),
+        wooden=np.repeat(np.array(wooden, bool), sizes),
     )
     return triangles, starts, np.concatenate(box).min(axis=0), np.concatenate(box).max(axis=0)
 

@@ -22,7 +22,7 @@ from softmode.deformables.model.neighbours import listed, movable_bodies
 from softmode.deformables.model.status import status_reasons
 from softmode.deformables.solver.observables import ReducedObservableKind
 from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
-from softmode.deformables.tools.gaps import rigid_gaps
+from softmode.deformables.tools.gaps import rigid_gaps, warn_of_overlaps
 from softmode.deformables.tools.grips import GripOptions, Grips, add_grip_slots
 from softmode.errors import ConfigError
 from softmode.objects.placed import Placed
@@ -35,6 +35,7 @@ from softmode.scenes.recording import Recording
 from softmode.scenes.scene import cameras_by_size
 from softmode.splats.cameras.camera import CameraOptions, SplatCamera
 from softmode.splats.raster.pinhole import PinholeCamera
+from softmode.stages import KERNELS, stage
 
 
 @cache
@@ -146,12 +147,11 @@ class SplatScene:
             _say_once(self.notes[0])
         bodies = list({id(thing.body): thing.body for thing in self.objects}.values())
         self.solver: SolverReduced | SolverCoupledReduced
-        if moving:
-            with mujoco_warnings():
-                mujoco = rigid(self.model)
-            self.solver = SolverCoupledReduced(self.model, bodies, options=options, rigid=mujoco)
-        else:
-            self.solver = SolverReduced(self.model, bodies, options=options)
+        with stage(KERNELS), mujoco_warnings():
+            if moving:
+                self.solver = SolverCoupledReduced(self.model, bodies, options=options, rigid=rigid(self.model))
+            else:
+                self.solver = SolverReduced(self.model, bodies, options=options)
         self.state: Any = self.model.state()
         self._scratch, self.control = self.model.state(), self.model.control()
         for state in (self.state, self._scratch):
@@ -185,9 +185,10 @@ class SplatScene:
     # -- time and pictures --------------------------------------------------------------------------------------------
 
     def step(self) -> None:
-        """Take the physics steps of one frame."""
+        """Take the physics steps of one frame; the first time, say what starts inside something else."""
         if self._step_graph is None:
             self._step_graph = capture_step(self, self._steps)
+            self.notes += warn_of_overlaps(self.solver, self.state, self.dt)
         self._step_graph.launch()
 
     def _steps(self) -> None:

@@ -8,9 +8,9 @@ import newton
 import numpy as np
 import warp as wp
 from newton.solvers import SolverMuJoCo
-from numpy.typing import NDArray
 
 from softmode.checks import require_number
+from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.coupling.rigid_solver import RigidSolver, mujoco_warnings
 from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
 from softmode.deformables.materials.material import Material
@@ -19,11 +19,11 @@ from softmode.deformables.model.compile_ahead import begin_compiling, compile_fo
 from softmode.deformables.model.declare import launch
 from softmode.deformables.model.status import status_reasons
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
-from softmode.deformables.tools.body_choice import BodyChoice, copy_slots
+from softmode.deformables.tools.body_choice import BodyChoice
 from softmode.deformables.tools.grips import GripOptions, Grips, add_grip_slots
 from softmode.errors import ConfigError
 from softmode.objects.config import ObjectConfig
-from softmode.objects.loader import Progress, load
+from softmode.objects.loader import Progress
 from softmode.objects.object_set import ObjectSet
 from softmode.objects.placed import Placed
 from softmode.objects.soft_object import SoftObject
@@ -38,13 +38,17 @@ from softmode.scenes.binding import BoundSplats
 from softmode.scenes.capture import capture_graph, capture_step, require_even
 from softmode.scenes.film_camera import FilmCamera, columns_of
 from softmode.scenes.fixture import Fixture, add_fixture
+from softmode.scenes.occupancy import Occupancy
 from softmode.scenes.recording import Recording
 from softmode.scenes.scene import cameras_by_size
 from softmode.splats.cameras.camera import CameraOptions, SplatCamera
 from softmode.splats.cameras.camera_randomization import CameraRandomization
+from softmode.splats.cameras.mesh_raster import FilmLook
 from softmode.splats.raster.pinhole import PinholeCamera
 from softmode.splats.splats import Splats
 
+Marker = Splats | Callable[[SoftObject], Splats]
+"""What marks a place in pictures: splats around the origin, or what draws them for the first object of a world."""
 GAP = 2.0e-4
 """Height over the table at which objects are put down [m]."""
 TABLE_PLACE = (0.35, 0.0, -0.03)
@@ -112,8 +116,8 @@ class TableScene:
         film: Cameras of one image size whose pictures people look at; see :meth:`draw_film`.
         camera_options: Light and background.
         camera_randomization: What `randomize` of the cameras draws.
-        marker: Splats around the origin that mark a place, such as a goal, in pictures; they touch nothing. A list of
-            them has those of each world, or of each object of the set where a reset may change the object.
+        marker: Splats around the origin that mark a place, such as a goal, in pictures, or what draws them for the
+            first object of a world; they touch nothing.
         device: Warp device; the default one if None.
         progress: Reports the build of the object, see :func:`softmode.deformables.reduction.build_body.build_body`.
     """
@@ -127,7 +131,7 @@ class TableScene:
         film: Sequence[PinholeCamera] = (),
         camera_options: CameraOptions | None = None,
         camera_randomization: CameraRandomization | None = None,
-        marker: Splats | Sequence[Splats] | None = None,
+        marker: Marker | None = None,
         device: wp.DeviceLike = None,
         progress: Progress = None,
     ) -> None:
@@ -137,9 +141,23 @@ class TableScene:
         self.world_count = world_count
         self.device = wp.get_device(device)
         self.dt = 1.0 / (config.control_hz * config.substeps)
-        self.after_substep: Callable[[int], None] | None = None
-        """Launches after each substep, whose number it is given."""
-        self._load(progress)
+        given = config.objects
+        if given is not None and given.resample and (config.others or config.grip_slots):
+            what = "others" if config.others else "grip_slots"
+            raise ConfigError(f"objects.resample and {what} exclude each other", hint=f"leave {what} out")
+        self.occupancy = Occupancy(
+            config.object,
+            given,
+            config.others,
+            material=config.material,
+            world_count=world_count,
+            device=self.device,
+            progress=progress,
+        )
+        """Which object each slot of each world holds."""
+        self.objects = self.occupancy.bodies
+        """The soft objects of a world, of world 0 where worlds differ (see `objects_of`); their instances follow each
+        other, world by world."""
         with compiling_aside(self.device):
             compile_for_building(self.device, control_kernels, kernels)
             self._build_model()
@@ -148,9 +166,9 @@ class TableScene:
         self.marker_place = wp.zeros(world_count, dtype=wp.transform, device=self.device)
         """Where the marker is drawn, transform, shape (world_count,)."""
         self.marker_place.fill_(wp.transform_identity())
-        self.marker = marker
-        """Splats that mark a place in pictures, as they were given; the last ones of `splats`."""
-        self._marker_rows: wp.array | None = None
+        self.marker = self.occupancy.drawn(marker) if callable(marker) else marker
+        """Splats that mark a place in pictures, the last ones of `splats`: one for all, or one per world, or per choice
+        of `occupancy` where a reset may change the object."""
         self.splats: BoundSplats | None = None
         """The splats of the objects, then those of the marker, as cameras see them; None without cameras."""
         self.cameras: dict[tuple[int, int], SplatCamera] = {}
@@ -158,24 +176,18 @@ class TableScene:
         self.film: FilmCamera | None = None
         """The cameras that people look through; None without any."""
         if cameras or film:
-            first = (
-                self.objects[0]
-                if len(self.members) == 1 and not self.resampled
-                else [self.members[m] for m in self.member]
-            )
-            things = (*[first] * self.slots, *self.objects[self.slots :])
-            resident = {"resident": self.members, "choice": self.object_index} if self.resampled else {}
-            self.splats = BoundSplats(self.model, things, others=() if marker is None else (marker,), **resident)
-            if marker is not None:
-                rest = self.splats.arrays.means.numpy()[:, self.splats.columns[-1]]
-                self.marker_points = wp.array(
-                    rest[:1] if isinstance(marker, Splats) else rest, dtype=wp.vec3, device=self.device
-                )
+            held = self.occupancy
+            choices = {"choices": held.choices, "choice": held.choice} if held.resampled else {}
+            marked = () if self.marker is None else (self.marker,)
+            self.splats = BoundSplats(self.model, held.shown, others=marked, **choices)
+            if self.marker is not None:
+                rest, one = self.splats.table.means.numpy()[:, self.splats.columns[-1]], isinstance(self.marker, Splats)
+                if held.resampled and not one:
+                    self.marker_points = held.follow(rest, wp.vec3)
+                else:
+                    self.marker_points = wp.array(rest[:1] if one else rest, dtype=wp.vec3, device=self.device)
                 """Centres of the marker's splats from `marker_place` [m], shape (1 or world_count, splats); a task may
                 put an array of its own here before the first picture, to change the marker's shape."""
-                if self.resampled and not isinstance(marker, Splats):
-                    table = self.splats.per_object[0][0].numpy()[:, self.splats.columns[-1]]
-                    self._marker_rows = wp.array(table, dtype=wp.vec3, device=self.device)
         if cameras and self.splats is not None:
             self.cameras = cameras_by_size(
                 self.model, self.splats, cameras, options=camera_options, randomization=camera_randomization
@@ -183,11 +195,11 @@ class TableScene:
         if film and self.splats is not None:
             seen, columns = self.splats.arrays, self.splats.columns
             things = slice(0, columns[len(self.splats.indices) - 1].stop)
-            goal = None if marker is None else columns_of(seen, columns[-1])
-            self.film = FilmCamera(self.model, self.state, columns_of(seen, things), goal, film)
+            goal = None if self.marker is None else columns_of(seen, columns[-1])
+            self.film = FilmCamera(self.model, self.state, columns_of(seen, things), goal, film, look=FilmLook())
         self._graph: Recording | None = None
         self._camera_graphs: dict[tuple[int, int], Recording] = {}
-        if self.slots > 1:
+        if self.occupancy.slots > 1:
             self.use_objects()
         self.reset()
 
@@ -196,101 +208,30 @@ class TableScene:
         """The first soft object, of world 0 where worlds differ."""
         return self.objects[0]
 
-    @property
-    def chosen(self) -> NDArray[np.intp]:
-        """Which object of the set each world has first, shape (world_count,); zeros without a set."""
-        return self.chosen_of_slots[:, 0] if self.resampled else self._chosen
-
-    @property
-    def chosen_of_slots(self) -> NDArray[np.intp]:
-        """Which objects of the set each world has, shape (world_count, slots), -1 for none."""
-        return self.object_index.numpy().astype(np.intp).reshape(self.world_count, self.slots)
-
-    @property
-    def member(self) -> NDArray[np.intp]:
-        """Which of `members` each world has, shape (world_count,)."""
-        return self.chosen if self.resampled else self._member
-
     def objects_of(self, world: int) -> tuple[SoftObject, ...]:
         """Return the soft objects of a world, those that are there."""
-        if self.slots == 1:
-            return (self.members[self.member[world]], *self.objects[1:])
-        return tuple(self.members[m] for m in self.chosen_of_slots[world] if m >= 0)
-
-    def instances_of(self, world: int) -> tuple[int, ...]:
-        """Return the instances of the solver that the soft objects of a world are, in the order of `objects_of`."""
-        first = world * len(self.objects)
-        if self.slots == 1:
-            return tuple(range(first, first + len(self.objects)))
-        return tuple(first + int(s) for s in np.flatnonzero(self.chosen_of_slots[world] >= 0))
+        return self.occupancy.objects_of(world)
 
     def marker_of(self, world: int) -> Splats | None:
         """Return the splats that mark a place in a world, as they were given; None without any."""
         if self.marker is None or isinstance(self.marker, Splats):
             return self.marker
-        return self.marker[self.member[world] if self.resampled else world]
+        return self.marker[self.occupancy.rows[world] if self.occupancy.resampled else world]
 
     # -- construction -------------------------------------------------------------------------------------------------
 
-    def _load(self, progress: Progress) -> None:
-        """Load what the worlds hold, each object once."""
-        config = self.config
-        loaded: dict[tuple[ObjectConfig, Material | None], SoftObject] = {}
-
-        def loaded_once(kind: ObjectConfig, material: Material | None) -> SoftObject:
-            if (kind, material) not in loaded:
-                loaded[kind, material] = load(kind, material=material, progress=progress)
-            return loaded[kind, material]
-
-        chosen: NDArray[np.intp] = np.zeros(self.world_count, dtype=np.intp)
-        self.resampled = config.objects is not None and config.objects.resample
-        """Whether a world may have another object of the set after a reset."""
-        self.slots = 1 if config.objects is None else config.objects.number_range[1]
-        """How many objects of the set a world has room for."""
-        if config.objects is None:
-            self.members: tuple[SoftObject, ...] = (loaded_once(config.object, config.material),)
-            """What object 0 of the worlds is: one soft object, or those of the set that some world has."""
-            self.materials: tuple[Material, ...] = (config.material,)
-            """What each of them is made of."""
-            self._member = chosen
-        else:
-            given = config.objects.resolved(config.object)
-            chosen = given.chosen(self.world_count)
-            held, self._member = np.unique(chosen, return_inverse=True)
-            if self.resampled:
-                if config.others or config.grip_slots:
-                    what = "others" if config.others else "grip_slots"
-                    raise ConfigError(f"objects.resample and {what} exclude each other", hint=f"leave {what} out")
-                held, self._member = np.arange(given.count), chosen
-            kinds = [(given.config(int(k)), given.material(int(k), config.material)) for k in held]
-            self.members = tuple(loaded_once(kind, own) for kind, own in kinds)
-            self.materials = tuple(
-                own or thing.material or config.material for thing, (_, own) in zip(self.members, kinds, strict=True)
-            )
-        self._chosen = chosen
-        shown = np.column_stack([chosen, np.full((self.world_count, self.slots - 1), -1)])
-        self._choice_of_slots = wp.array(shown.reshape(-1), dtype=int, device=self.device)
-        self.object_index: wp.array = self._choice_of_slots
-        """Which object of the set each world has, int32, shape (world_count,); zeros without a set. Shape (world_count,
-        slots) where it may have several, -1 for a slot without one."""
-        if self.slots > 1:
-            self.object_index = self._choice_of_slots.reshape((self.world_count, self.slots))
-        others = tuple(loaded_once(kind, config.material) for kind in config.others)
-        self.objects: tuple[SoftObject, ...] = (*[self.members[self._member[0]]] * self.slots, *others)
-        """The soft objects of a world, of world 0 where worlds differ (see `objects_of`); their instances follow each
-        other, world by world."""
-
     def _build_model(self) -> None:
         """Make a world for each object that object 0 may be, and a model of as many copies of each as are wanted."""
-        worlds = [self._world(thing, made_of) for thing, made_of in zip(self.members, self.materials, strict=True)]
+        held = self.occupancy
+        worlds = [self._world(thing, made_of) for thing, made_of in zip(held.choices, held.materials, strict=True)]
         builder = newton.ModelBuilder()
         register_custom_attributes(builder)
         SolverMuJoCo.register_custom_attributes(builder)
         if len(worlds) == 1:
             builder.replicate(worlds[0], self.world_count)
         else:
-            for m in self._member:
-                builder.add_world(worlds[m])
+            for row in held.rows:
+                builder.add_world(worlds[row])
         self.model: Any = builder.finalize(device=self.device)  # Any: it carries the attributes of soft bodies
         cut_circles(self.model, builder, *worlds)
 
@@ -303,13 +244,13 @@ class TableScene:
         table = Fixture(label="table", position=TABLE_PLACE, size=TABLE_SIZE, color=slate, friction=friction)
         for fixture in (table, *config.fixtures):
             add_fixture(world, fixture)
-        for thing in (*[first] * self.slots, *self.objects[self.slots :]):
+        for thing in (*[first] * self.occupancy.slots, *self.occupancy.others):
             placed = Placed(object=thing, position=(*config.object_position, thing.height))
             instance = placed.add_to(world, material=material if thing is first else config.material)
             if config.grip_slots:
                 add_grip_slots(world, instance, config.grip_slots)
-            if self.resampled:
-                bodies = [one.body for one in self.members]
+            if self.occupancy.resampled:
+                bodies = [one.body for one in self.occupancy.choices]
                 functions = max(body.function_count for body in bodies) - thing.body.function_count
                 reserve_room(world, functions, max(body.surface_count for body in bodies) - thing.body.surface_count)
         return world
@@ -319,7 +260,7 @@ class TableScene:
         config, model, worlds = self.config, self.model, self.world_count
         with mujoco_warnings():
             rigid = RigidSolver(model, njmax=config.constraint_max, nconmax=config.rigid_contact_max)
-        found = {id(thing.body): thing.body for thing in (*self.members, *self.objects)}
+        found = {id(thing.body): thing.body for thing in (*self.occupancy.choices, *self.objects)}
         distinct = list(found.values())
         self.solver = SolverCoupledReduced(model, distinct, options=config.solver, rigid=rigid)
         self.state: Any = model.state()
@@ -344,13 +285,11 @@ class TableScene:
         starts, fingers = model.body_world_start.numpy()[:worlds], finger_links(config.arm, self.arm)
         fingers = np.where(fingers < 0, -1, starts[:, None, None] + fingers)
         self.finger_body = wp.array(fingers, dtype=int, device=device)
-        self._bases = self._object_bases()
+        self._bases = self._object_bases(found)
         self._choice: BodyChoice | None = None
-        if self.resampled:
-            self._choice = BodyChoice(self.solver, [thing.body for thing in self.members], self.materials)
-            place = {key: row for row, key in enumerate(found)}  # bodies are told apart by identity
-            rows = [[place[id(thing.body)]] * self.slots for thing in self.members]
-            self._base_rows = wp.array(np.array(rows), dtype=int, device=device)
+        if self.occupancy.resampled:
+            bodies = [thing.body for thing in self.occupancy.choices]
+            self._choice = BodyChoice(self.solver, bodies, self.occupancy.materials)
         self.world_mask = wp.ones(worlds, dtype=wp.bool, device=device)
         """Which worlds `reset_worlds` resets, shape (world_count,)."""
         self._solver_mask = wp.zeros(worlds + 1, dtype=wp.bool, device=device)
@@ -359,21 +298,17 @@ class TableScene:
         self.place_yaw = wp.zeros(instances, dtype=wp.float64, device=device)
         """Its rotation about the vertical [rad]."""
 
-    def _object_bases(self) -> Any:
-        """Return what places and centres of the objects follow from, on the device."""
-        device, bodies, rows = self.device, [], {}
-        for thing in (*self.members, *self.objects):
-            if rows.setdefault(id(thing.body), len(bodies)) == len(bodies):
-                bodies.append(thing.body)
+    def _object_bases(self, found: dict[int, ReducedBody]) -> Any:
+        """Return what places and centres of the objects follow from, on the device; bodies are told by identity."""
+        device, held, bodies = self.device, self.occupancy, found.values()
         most = max(body.function_count for body in bodies)
         linear, mean = np.zeros((len(bodies), most, 4)), np.zeros((len(bodies), most))
         for b, body in enumerate(bodies):
             linear[b, : body.function_count], mean[b, : body.function_count] = body.linear_coordinates, body.mean_basis
-        first = np.array([rows[id(thing.body)] for thing in self.members])[self._member]
-        others = np.array([rows[id(thing.body)] for thing in self.objects[self.slots :]], int)
-        body = np.column_stack([*[first] * self.slots, np.tile(others, (self.world_count, 1))]).reshape(-1)
+        place = {key: row for row, key in enumerate(found)}
+        rows = [[place[id(o.body)] for o in (*[first] * held.slots, *held.others)] for first in held.choices]
         bases = kernels.ObjectBases()
-        bases.body = wp.array(body, dtype=int, device=device)
+        bases.body = held.follow(rows, int, every_slot=True).flatten()  # the same memory
         bases.function_start = self.model.softmode.function_start
         bases.function_count = self.solver.tables.instances.function_count
         bases.linear = wp.array(linear, dtype=wp.float64, device=device)
@@ -403,7 +338,7 @@ class TableScene:
         mask = np.ones(worlds, bool) if world_mask is None else np.asarray(world_mask, bool)
         place = np.empty((worlds, count, 3))
         place[:, :, :2] = self.config.object_position
-        place[:, :, 2] = self.heights + GAP
+        place[:, :, 2] = self.occupancy.heights + GAP
         turn = np.zeros((worlds, count))
         if position is not None:
             place[:, 0, :2] = position
@@ -426,7 +361,7 @@ class TableScene:
         dim = (worlds * len(self.objects), self._bases.mean.shape[1])
         launch(self.device, kernels.place_objects, dim, self._bases, *place, *outputs)
         self.solver.update_particles(state)
-        if self.slots > 1:
+        if self.occupancy.slots > 1:
             room = (wp.vec3(*PARKED), data.particle_start, self.solver.tables.layout.sample_max)
             parked = (state.softmode.q, state.softmode.qd, state.particle_q, state.particle_qd)
             launch(self.device, kernels.park_objects, dim[0], self._bases, self.world_mask, *room, *parked)
@@ -435,7 +370,7 @@ class TableScene:
         self.observe()
 
     def use_objects(self) -> None:
-        """Put the objects that `object_index` says into the worlds of `world_mask`; capturable.
+        """Put the objects that `occupancy` has chosen into the worlds of `world_mask`; capturable.
 
         Materials, places and the state come after it: set the parameters and call `reset_worlds`.
 
@@ -444,24 +379,10 @@ class TableScene:
         """
         if self._choice is None:
             raise ConfigError("the worlds keep their objects", hint="give objects=ObjectSet([...], resample=True)")
-        self._choice.set(self._choice_of_slots, self.world_mask)
-        bodies = self._bases.body.reshape((self.world_count, self.slots))
-        self.copy_rows(self._base_rows, bodies, every_slot=True)
+        self._choice.set(self.occupancy.choice, self.world_mask)
+        self.occupancy.put(self.world_mask)
         if self.splats is not None:
             self.splats.choose(self.world_mask)
-        if self._marker_rows is not None:
-            self.copy_rows(self._marker_rows, self.marker_points)
-
-    def copy_rows(self, table: wp.array, out: wp.array, *, every_slot: bool = False) -> None:
-        """Copy from a table with a row per object that of its object to each world of `world_mask`; capturable.
-
-        Args:
-            table: Shape (members, ...).
-            out: Shape (world_count, ...).
-            every_slot: Whether the second axis has an entry per slot, which follows the object of that slot, and is
-                zero where there is none. Else all follows the first.
-        """
-        copy_slots(table, out, self._choice_of_slots, self.world_mask, parts=[1] * self.slots if every_slot else None)
 
     def _set_stiffness(self, mask: np.ndarray, youngs_modulus: np.ndarray) -> None:
         """Change E in the masked worlds."""
@@ -543,17 +464,6 @@ class TableScene:
                 launch(self.device, kernels.place_marker, dim, *arrays)
 
     # -- reading ------------------------------------------------------------------------------------------------------
-
-    @property
-    def heights(self) -> NDArray[np.float64]:
-        """Height of the centre of every unscaled object over the table at rest [m], shape (world_count, objects).
-
-        Zero for an object that is not there.
-        """
-        heights = np.array([*(thing.height for thing in self.members), 0.0])
-        first = heights[self.chosen_of_slots] if self.slots > 1 else heights[self.member][:, None]
-        others = np.array([thing.height for thing in self.objects[self.slots :]])
-        return np.column_stack([first, np.tile(others, (self.world_count, 1))])
 
     @property
     def status(self) -> np.ndarray:

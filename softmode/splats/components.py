@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from softmode.checks import require_number
-from softmode.splats.splats import Splats
+from softmode.splats.splats import Splats, rotations_from_quats
 
 DENSE = 20_000
 """Above so many splats a capture is thinned out before its splats are linked."""
@@ -32,24 +35,84 @@ def split_components(
     Raises:
         ConfigError: If the gap is not positive.
     """
+    label = label_components(splats, gap=gap, min_opacity=min_opacity, min_count=min_count)
+    return [splats.subset(label == part) for part in range(label.max(initial=-1) + 1)]
+
+
+def label_components(
+    splats: Splats, *, gap: float | None = None, min_opacity: float = 0.2, min_count: int = 20, faces: bool = False
+) -> NDArray[np.intp]:
+    """Return the part of each splat (N,), as `split_components` orders them; -1 for what belongs to none.
+
+    Args:
+        splats: The capture.
+        gap: As there.
+        min_opacity: As there.
+        min_count: As there.
+        faces: Whether wide flat splats hold together what their discs touch: the few large splats of a plain face lie
+            farther apart than the fine ones of its rim.
+    """
     if gap is None:
         low, high = splats.bounds(quantile=0.01)
         gap = max(0.015 * float(np.linalg.norm(high - low)), 1e-9)
     require_number("gap", gap, above=0.0, hint="Give a distance in the unit of the asset")
     solid = np.flatnonzero(splats.opacities >= min_opacity)
     if len(solid) == 0:
-        return []
-    # Of a dense capture one splat in each cell of a quarter of the gap makes the chains.
-    links = solid
-    if len(solid) > DENSE:
-        cell = np.floor(splats.means[solid] / (0.25 * gap)).astype(np.int64)
-        links = solid[np.sort(np.unique(cell, axis=0, return_index=True)[1])]
-    tree = KDTree(splats.means[links])
-    pairs = tree.query_pairs(gap, output_type="ndarray")
-    graph = coo_matrix((np.ones(len(pairs), dtype=bool), pairs.T), shape=(len(links), len(links)))
-    label = connected_components(graph, directed=False)[1]
+        return np.full(splats.count, -1, dtype=np.intp)
+    points = splats.means[solid]
+    if faces:
+        points = np.concatenate([points, _disc_points(splats, solid, gap)])
+    tree, label = _chains(points, gap)
     distance, nearest = tree.query(splats.means)
     every = np.where(distance <= gap, label[nearest], -1)
     count = np.bincount(every[solid], minlength=label.max() + 1)
     order = np.argsort(-count, kind="stable")
-    return [splats.subset(every == part) for part in order if count[part] >= min_count]
+    order = order[count[order] >= min_count]
+    place = np.full(len(count) + 1, -1, dtype=np.intp)
+    place[order] = np.arange(len(order))
+    return place[every]
+
+
+def link_labels(points: NDArray[Any], gap: float) -> NDArray[np.intp]:
+    """Return a number per point (N,) of points (N, 3), the same for those that chains of steps up to `gap` join."""
+    tree, label = _chains(points, gap)
+    return label[tree.query(points)[1]]
+
+
+def _chains(points: NDArray[Any], gap: float) -> tuple[KDTree, NDArray[np.intp]]:
+    """Return the points that make chains, and the chain of each."""
+    if len(points) > DENSE:  # Of a dense capture one splat in each cell of a quarter of the gap makes the chains.
+        cell = np.floor(points / (0.25 * gap)).astype(np.int64)
+        cell = np.clip(cell - np.median(cell, axis=0).astype(np.int64), -(2**19), 2**19 - 1) + 2**19
+        key = (cell[:, 0] << 40) + (cell[:, 1] << 20) + cell[:, 2]
+        points = points[np.sort(np.unique(key, return_index=True)[1])]
+    tree = KDTree(points)
+    pairs = tree.query_pairs(gap, output_type="ndarray")
+    graph = coo_matrix((np.ones(len(pairs), dtype=bool), pairs.T), shape=(len(points), len(points)))
+    label: Any = connected_components(graph, directed=False)[1]
+    return tree, label.astype(np.intp)
+
+
+def _disc_points(splats: Splats, solid: NDArray[np.intp], gap: float) -> NDArray[np.float32]:
+    """Return points on the discs of flat splats that are wider than half the gap."""
+    low, high = splats.bounds(quantile=0.01)
+    scales = np.sort(splats.scales, axis=1)
+    flat = (scales[:, 1] > 0.5 * gap) & (scales[:, 0] < 0.3 * scales[:, 1]) & (splats.opacities >= 0.5)
+    some = solid[(flat & (scales[:, 2] < 0.25 * np.linalg.norm(high - low)))[solid]]
+    order = np.argsort(-splats.scales[some], axis=1)[:, None, :2]
+    axes = np.take_along_axis(rotations_from_quats(splats.quats[some]), order, axis=2)
+    tangents = axes * np.take_along_axis(splats.scales[some], order[:, 0], axis=1)[:, None]
+    return disc_points(splats.means[some], tangents, gap)
+
+
+def disc_points(means: NDArray[Any], tangents: NDArray[Any], gap: float) -> NDArray[np.float32]:
+    """Return points about a gap apart on discs of one and a half tangents (N, 3, 2) around centres (N, 3)."""
+    found = [np.zeros((0, 3))]
+    rings = np.clip(np.ceil(1.5 * np.linalg.norm(tangents, axis=1).max(axis=1) / gap), 2, 8).astype(int)
+    for count in np.unique(rings):
+        same = rings == count
+        turn = np.linspace(0.0, 2.0 * np.pi, 6 * count, endpoint=False)
+        disc = np.stack([np.cos(turn), np.sin(turn)])
+        disc = np.concatenate([1.5 * (k + 1) / count * disc for k in range(count)], axis=1)
+        found.append((means[same, None] + np.einsum("nij,jk->nki", tangents[same], disc)).reshape(-1, 3))
+    return np.concatenate(found).astype(np.float32)

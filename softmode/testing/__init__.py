@@ -11,28 +11,15 @@ from typing import TYPE_CHECKING
 from softmode.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from softmode.testing.assertions import (
-        assert_max_force,
-        assert_max_penetration,
-        assert_no_flag,
-        assert_replays,
-        assert_success,
-    )
-    from softmode.testing.episode import Episode, play_episode
-    from softmode.testing.golden import assert_golden
-    from softmode.testing.task_check import TaskCheck, check_task
-
-__all__ = [
-    "Episode",
-    "TaskCheck",
-    "assert_golden",
-    "assert_max_force",
-    "assert_max_penetration",
-    "assert_no_flag",
-    "assert_replays",
-    "assert_success",
-    "check_task",
-    "play_episode",
-]
+    from softmode.testing.assertions import assert_max_force as assert_max_force
+    from softmode.testing.assertions import assert_max_penetration as assert_max_penetration
+    from softmode.testing.assertions import assert_no_flag as assert_no_flag
+    from softmode.testing.assertions import assert_replays as assert_replays
+    from softmode.testing.assertions import assert_success as assert_success
+    from softmode.testing.episode import Episode as Episode
+    from softmode.testing.episode import play_episode as play_episode
+    from softmode.testing.golden import assert_golden as assert_golden
+    from softmode.testing.task_check import TaskCheck as TaskCheck
+    from softmode.testing.task_check import check_task as check_task
 
 __getattr__, __dir__ = lazy_names(__name__)

@@ -159,7 +159,7 @@ def played(env: gym.Env, base: SoftEnv, action: Any, result: list[Any] | None = 
     return Step(
         action=scene.actions.numpy()[0].copy(),
         observation=task.observation.numpy()[0].copy(),
-        reward=float(task.reward.numpy()[0]),
+        reward=float(task.episodes.reward.numpy()[0]),
         info=returned[-1],
         force=float(np.linalg.norm(wrench[:, :3], axis=1).max(initial=0.0)),
         depth=_depth(base),

@@ -10,27 +10,18 @@ from typing import TYPE_CHECKING
 from softmode.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from softmode.objects.stage.scene import UsdDeformable, UsdScene, read_usd_scene
-    from softmode.usd.animation import UsdAnimation, UsdAnimationOptions
-    from softmode.usd.importer import UsdImport, add_usd
-    from softmode.usd.playback import PlayedBody, UsdPlayback, read_animation
-    from softmode.usd.splat_animation import write_splat_animation
-    from softmode.usd.writer import UsdExportOptions, write_usd
-
-__all__ = [
-    "PlayedBody",
-    "UsdAnimation",
-    "UsdAnimationOptions",
-    "UsdDeformable",
-    "UsdExportOptions",
-    "UsdImport",
-    "UsdPlayback",
-    "UsdScene",
-    "add_usd",
-    "read_animation",
-    "read_usd_scene",
-    "write_splat_animation",
-    "write_usd",
-]
+    from softmode.objects.stage.scene import UsdDeformable as UsdDeformable
+    from softmode.objects.stage.scene import UsdScene as UsdScene
+    from softmode.objects.stage.scene import read_usd_scene as read_usd_scene
+    from softmode.usd.animation import UsdAnimation as UsdAnimation
+    from softmode.usd.animation import UsdAnimationOptions as UsdAnimationOptions
+    from softmode.usd.importer import UsdImport as UsdImport
+    from softmode.usd.importer import add_usd as add_usd
+    from softmode.usd.playback import PlayedBody as PlayedBody
+    from softmode.usd.playback import UsdPlayback as UsdPlayback
+    from softmode.usd.playback import read_animation as read_animation
+    from softmode.usd.splat_animation import write_splat_animation as write_splat_animation
+    from softmode.usd.writer import UsdExportOptions as UsdExportOptions
+    from softmode.usd.writer import write_usd as write_usd
 
 __getattr__, __dir__ = lazy_names(__name__)

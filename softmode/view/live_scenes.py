@@ -29,6 +29,7 @@ from softmode.scenes.table_scene import TableScene
 from softmode.splats.raster.pinhole import PinholeCamera
 from softmode.splats.splats import Splats
 from softmode.view.live_types import HoldName, LiveOptions, SceneName, Vector
+from softmode.view.picture import goal_marker
 
 BLOCK_STEPS = 2
 """Physics steps of a block of an object without an environment; even, there and back between two states."""
@@ -185,7 +186,8 @@ class EnvScene:
         self.scene: TableScene = task.scene
         self.block_steps = self.scene.config.substeps
         self.block_dt = 1.0 / self.scene.config.control_hz
-        self.marker: Splats | None = self.scene.marker_of(0)
+        self.marker: Splats | None = goal_marker(task)
+        self._ring = self.marker.means.astype(np.float64) if task.goal_ring and self.marker is not None else None
         self.viewpoints: Sequence[PinholeCamera] = task.render_cameras()
         self.config = base
         self._factory = policy_factory(policy, self._env, trained)
@@ -230,7 +232,8 @@ class EnvScene:
         if self.marker is None:
             return np.zeros((0, 3)), np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
         points, place = self.scene.marker_points, self.scene.marker_place
-        return points.numpy()[0].astype(np.float64), place.numpy()[0].astype(np.float64)
+        rest = points.numpy()[0].astype(np.float64) if self._ring is None else self._ring
+        return rest, place.numpy()[0].astype(np.float64)
 
     def close(self) -> None:
         """Close the environment."""

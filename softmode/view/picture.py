@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import newton
 import numpy as np
 from numpy.typing import NDArray
 
 from softmode.deformables.model.namespaces import soft
+from softmode.envs.film import RING
+from softmode.envs.markers import ring_marker
 from softmode.objects.soft_object import SoftObject
 from softmode.scenes.binding import BoundSplats
 from softmode.splats.splats import Splats, rotations_from_quats
 from softmode.view.live_types import Hit, SplatPicture
 
 Array = NDArray[np.float64]
-_SIX = [0, 1, 2, 1, 3, 4, 2, 4, 5]
+SIX = [0, 1, 2, 1, 3, 4, 2, 4, 5]
 """Where the entries of a symmetric matrix are among xx, xy, xz, yy, yz, zz."""
 OPAQUE = 0.5
 """A ray stops where so much of the light behind is gone."""
@@ -23,6 +26,11 @@ REACH = 3.0
 """How many standard deviations a splat reaches for a ray."""
 SLACK = 0.01
 """A ray that meets nothing takes the splat nearest to it, within this fraction of the object's size."""
+
+
+def goal_marker(task: Any) -> Splats | None:
+    """Return the splats about `marker_place` that show a task's goal in a view: a level ring where films have one."""
+    return ring_marker(RING * task.scene.soft.radius) if task.goal_ring else task.scene.marker_of(0)
 
 
 class LivePicture:
@@ -63,7 +71,7 @@ class LivePicture:
     def read(self) -> SplatPicture:
         """Return the splats on the host."""
         means, six = self.bound.arrays.means.numpy()[0], self.bound.arrays.covariances.numpy()[0]
-        covariances = six[:, _SIX].reshape(-1, 3, 3)
+        covariances = six[:, SIX].reshape(-1, 3, 3)
         return SplatPicture(means=means.copy(), covariances=covariances, colors=self.colors, opacities=self.opacities)
 
     def pick(self, origin: Array, direction: Array, state: newton.State) -> Hit | None:

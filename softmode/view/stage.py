@@ -14,8 +14,6 @@ from softmode.view.live_types import DragView, SplatPicture, Vector
 if TYPE_CHECKING:
     import viser
 
-    from softmode.view.session import LiveSession
-
 GRIP_MAX = 400
 """Spheres that receive the mouse."""
 DRAG_COLOR = (255, 120, 30)
@@ -31,8 +29,9 @@ class Stage:
 
     Args:
         server: Where it is shown.
-        session: What is shown.
-        on_drag: Called with viser's drag events on the object; they hold world positions and the client.
+        session: What is shown, a `LiveSession`; or less of one where nobody touches it.
+        on_drag: Called with viser's drag events on the object; they hold world positions and the client. None for a
+            stage to look at, whose session has neither drags nor pins.
         on_click: The same for clicks.
         on_pin: Called with the number of a pin, a position and a quaternion (w, x, y, z) when its gizmo is moved.
     """
@@ -40,11 +39,11 @@ class Stage:
     def __init__(
         self,
         server: viser.ViserServer,
-        session: LiveSession,
+        session: Any,
         *,
-        on_drag: Handler,
-        on_click: Handler,
-        on_pin: Callable[[int, Vector, Vector], None],
+        on_drag: Handler | None = None,
+        on_click: Handler | None = None,
+        on_pin: Callable[[int, Vector, Vector], None] | None = None,
     ) -> None:
         """Build the scene."""
         self._server, self._session, self._on_pin = server, session, on_pin
@@ -53,6 +52,8 @@ class Stage:
         self._look()
         self._add_meshes()
         self._add_objects()
+        if on_drag is None:
+            return
         self.stroke: tuple[Vector, Vector] | None = None
         """Ends of the stroke that somebody draws [m], or None."""
         nowhere = np.zeros((1, 2, 3), np.float32)
@@ -71,21 +72,23 @@ class Stage:
         """Show the session as it is now."""
         if self._generation != self._session.generation:
             self._splats.remove()
-            self._grips.remove()
+            if self._on_drag is not None:
+                self._grips.remove()
             self._add_objects()
         picture = self._session.splats()
         words = self._gaussians.pack(picture.means, picture.covariances)
         poses = self._session.poses()
-        grips = self._surfaces()[self._grip_samples].astype(np.float32)
-        drag = self._session.drag()
+        touched = self._on_drag is not None
+        grips = self._surfaces()[self._grip_samples].astype(np.float32) if touched else None
         with self._server.atomic():  # one message: splats never run ahead of the hand that holds them
             self._splats.buffer = words
-            self._grips.batched_positions = grips
             for body, frame in self._frames.items():
                 x, y, z, i, j, k, w = poses[body].tolist()
                 frame.position, frame.wxyz = (x, y, z), (w, i, j, k)
-            self._show_drag(drag)
-            self._show_pins()
+            if grips is not None:
+                self._grips.batched_positions = grips
+                self._show_drag(self._session.drag())
+                self._show_pins()
         self._server.flush()
 
     def _look(self) -> None:
@@ -137,13 +140,14 @@ class Stage:
             opacities=picture.opacities.reshape(-1, 1).clip(0.0, 1.0),
             scale=unit,
         )
-        self._add_grips(picture)
+        if self._on_drag is not None:
+            self._add_grips(picture, self._on_drag)
 
     def _surfaces(self) -> Vector:
         """Return the surface samples of all objects [m], shape (S, 3)."""
         return np.concatenate([self._session.surface(k) for k in range(len(self._session.objects))])
 
-    def _add_grips(self, picture: SplatPicture) -> None:
+    def _add_grips(self, picture: SplatPicture, on_drag: Handler) -> None:
         """Cover the object with invisible spheres that receive the mouse.
 
         Splats receive none. A mesh does, but viser's own materials write depth even where they are transparent, which
@@ -161,14 +165,14 @@ class Stage:
         self._grips = self._server.scene.add_batched_glb(
             "/grips", _invisible_sphere(radius), **places, lod="off", cast_shadow=False, receive_shadow=False
         )
-        self._grips.on_drag("left")(self._on_drag)
+        self._grips.on_drag("left")(on_drag)
         if self._clickable:
             self.set_clickable(True)
 
     def set_clickable(self, clickable: bool) -> None:
         """Let clicks on the object through, or not; where they are, the browser outlines what is under the mouse."""
         self._clickable = clickable
-        if clickable:
+        if clickable and self._on_click is not None:
             self._grips.on_click(self._on_click)
         else:
             self._grips.remove_click_callback("all")
@@ -206,6 +210,7 @@ class Stage:
         )
 
         async def moved(event: Any) -> None:
+            assert self._on_pin is not None
             self._on_pin(number, np.array(event.target.position), np.array(event.target.wxyz))
 
         gizmo.on_update(moved)

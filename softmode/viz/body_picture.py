@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import textwrap
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,12 +15,12 @@ from scipy.spatial.transform import Rotation
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.reduction.body_modes import soft_modes
 from softmode.deformables.reduction.report import BodyReport
-from softmode.errors import ConfigError, GraspError, needs_extra
-from softmode.files import whole_file
+from softmode.errors import GraspError
 from softmode.objects.rest_grasps import rest_grasps
 from softmode.robots.arm import ArmDescription
 from softmode.robots.jaws import ParallelJaw
 from softmode.splats.splats import SH_DC, Splats
+from softmode.viz.figure_file import figure_file
 
 Array = NDArray[np.float64]
 
@@ -76,52 +75,41 @@ def write_body_picture(
         ConfigError: If the name is not that of a .png.
         StorageError: If it cannot be written.
     """
-    with needs_extra("viz", "the picture of a body needs matplotlib"):
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    from PIL import Image
+    told = {"what": "picture", "whole": "the picture of a body", "like": "toy.png"}
+    with figure_file(path, (14.0, 9.0), **told, few_colors=True) as figure:
+        modes = soft_modes(body, COLUMNS - 1)[1]
+        names, weights = _weights(body, splats)
+        asset = [splats, *_moved(body, splats, modes)]
+        pictures = _render(body, [*asset, *(_painted(body, splats, color) for color in weights)])
+        frequency = mode_frequencies(body, youngs_modulus=youngs_modulus, density=density)
 
-    target = Path(path)
-    if target.suffix.lower() != ".png":
-        raise ConfigError(f"picture {target} is no .png file", hint="name it like toy.png")
-    modes = soft_modes(body, COLUMNS - 1)[1]
-    names, weights = _weights(body, splats)
-    asset = [splats, *_moved(body, splats, modes)]
-    pictures = _render(body, [*asset, *(_painted(body, splats, color) for color in weights)])
-    frequency = mode_frequencies(body, youngs_modulus=youngs_modulus, density=density)
-
-    strip = 13.5 / COLUMNS * pictures[0].shape[0] / pictures[0].shape[1]  # height of a row of pictures [in]
-    height = 2.0 * strip + 4.8
-    figure = Figure(figsize=(14.0, height), dpi=100, facecolor="white")
-    canvas = FigureCanvasAgg(figure)
-    edges = {"left": 0.02, "right": 0.985, "top": 1.0 - 0.8 / height, "bottom": 0.5 / height}
-    gap = 0.5 / ((2.0 * strip + 3.0) / 3.0)
-    rows = figure.add_gridspec(3, 1, height_ratios=(strip, strip, 3.0), hspace=gap, **edges)
-    x, y, z = 1e2 * np.ptp(body.bounds, axis=0)
-    facts = (
-        f"{x:.3g} x {y:.3g} x {z:.3g} cm, {1e6 * body.volume:.4g} cm$^3$ · {body.function_count} functions · "
-        f"{body.mode_count} handles · {body.point_count} cubature points · {len(body.centres)} kernels"
-    )
-    figure.text(0.02, 1.0 - 0.35 / height, body.name, fontsize=15, weight="bold")
-    figure.text(0.985, 1.0 - 0.35 / height, facts, fontsize=10, ha="right", color="0.3")
-    titles = ["at rest", *(f"soft mode {k + 1}: {frequency[k]:.3g} Hz" for k in range(len(modes)))]
-    _strip(figure, rows[0], titles, pictures[: len(titles)])
-    _strip(figure, rows[1], names, pictures[len(titles) :])
-    lower = rows[2].subgridspec(1, 5, width_ratios=(0.85, 0.85, 0.85, 0.8, 2.1), wspace=0.24)
-    _draw_points(figure.add_subplot(lower[0]), body)
-    _draw_kernels(figure.add_subplot(lower[1]), body)
-    _draw_grasps(figure.add_subplot(lower[2]), body, youngs_modulus, density)
-    spectra = lower[3].subgridspec(2, 1, hspace=0.75)
-    _draw_spectrum(figure.add_subplot(spectra[0]), body.eigenvalues[1:], "skinning eigenvalues [1/m$^2$]", "eigenmode")
-    title = f"[Hz], E = {youngs_modulus:.3g} Pa, {density:.3g} kg/m$^3$"
-    _draw_spectrum(figure.add_subplot(spectra[1]), frequency, title, "elastic mode")
-    _write_report(figure.add_subplot(lower[4]), body, report)
-    canvas.draw()
-    picture = Image.fromarray(np.asarray(canvas.buffer_rgba())[:, :, :3])
-    with whole_file(target, "picture") as file:
-        # 256 colours, dithered, are enough here and make half the size.
-        few = picture.quantize(palette=picture.quantize(256), dither=Image.Dither.FLOYDSTEINBERG)
-        few.save(file, format="png", optimize=True)
+        strip = 13.5 / COLUMNS * pictures[0].shape[0] / pictures[0].shape[1]  # height of a row of pictures [in]
+        height = 2.0 * strip + 4.8
+        figure.set_size_inches(14.0, height)
+        edges = {"left": 0.02, "right": 0.985, "top": 1.0 - 0.8 / height, "bottom": 0.5 / height}
+        gap = 0.5 / ((2.0 * strip + 3.0) / 3.0)
+        rows = figure.add_gridspec(3, 1, height_ratios=(strip, strip, 3.0), hspace=gap, **edges)
+        x, y, z = 1e2 * np.ptp(body.bounds, axis=0)
+        facts = (
+            f"{x:.3g} x {y:.3g} x {z:.3g} cm, {1e6 * body.volume:.4g} cm$^3$ · {body.function_count} functions · "
+            f"{body.mode_count} handles · {body.point_count} cubature points · {len(body.centres)} kernels"
+        )
+        figure.text(0.02, 1.0 - 0.35 / height, body.name, fontsize=15, weight="bold")
+        figure.text(0.985, 1.0 - 0.35 / height, facts, fontsize=10, ha="right", color="0.3")
+        titles = ["at rest", *(f"soft mode {k + 1}: {frequency[k]:.3g} Hz" for k in range(len(modes)))]
+        _strip(figure, rows[0], titles, pictures[: len(titles)])
+        _strip(figure, rows[1], names, pictures[len(titles) :])
+        lower = rows[2].subgridspec(1, 5, width_ratios=(0.85, 0.85, 0.85, 0.8, 2.1), wspace=0.24)
+        _draw_points(figure.add_subplot(lower[0]), body)
+        _draw_kernels(figure.add_subplot(lower[1]), body)
+        _draw_grasps(figure.add_subplot(lower[2]), body, youngs_modulus, density)
+        spectra = lower[3].subgridspec(2, 1, hspace=0.75)
+        _draw_spectrum(
+            figure.add_subplot(spectra[0]), body.eigenvalues[1:], "skinning eigenvalues [1/m$^2$]", "eigenmode"
+        )
+        title = f"[Hz], E = {youngs_modulus:.3g} Pa, {density:.3g} kg/m$^3$"
+        _draw_spectrum(figure.add_subplot(spectra[1]), frequency, title, "elastic mode")
+        _write_report(figure.add_subplot(lower[4]), body, report)
 
 
 # -- what the splats show ---------------------------------------------------------------------------------------------
@@ -129,7 +117,7 @@ def write_body_picture(
 
 def _moved(body: ReducedBody, splats: Splats, modes: Array) -> list[Splats]:
     """Return the splats displaced by each mode, so far that the largest displacement is a fixed part of the size."""
-    from softmode.deformables.skinning.skin_splats import average_basis
+    from softmode.deformables.skinning.averages import average_basis
 
     value, gradient = average_basis(body, splats.means, splats.covariances())
     size, found = float(np.linalg.norm(np.ptp(body.bounds, axis=0))), []

@@ -5,14 +5,12 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
-from softmode.errors import ConfigError, needs_extra
-from softmode.files import whole_file
 from softmode.objects.config import ObjectConfig
 from softmode.objects.source import object_source
+from softmode.viz.figure_file import figure_file
 from softmode.viz.splat_sheet import draw_view
 
 COLUMNS = 5
@@ -33,26 +31,18 @@ def write_preset_sheet(path: str | os.PathLike[str], objects: Sequence[ObjectCon
         ConfigError: If the name is not that of a .png.
         StorageError: If it cannot be written.
     """
-    with needs_extra("viz", "a sheet of objects needs matplotlib"):
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    target = Path(path)
-    if target.suffix.lower() != ".png":
-        raise ConfigError(f"sheet {target} is no .png file", hint="name it like presets.png")
     columns = min(COLUMNS, len(objects))
     rows = math.ceil(len(objects) / columns)
-    figure = Figure(figsize=(3.2 * columns, 3.45 * rows), dpi=100, facecolor="white")
-    canvas = FigureCanvasAgg(figure)
-    grid = figure.add_gridspec(rows, columns, left=0.01, right=0.99, top=1.0 - 0.1 / rows, bottom=0.01, hspace=0.1)
-    for k, config in enumerate(objects):
-        source = object_source(config)
-        edges = " x ".join(f"{1e3 * edge:.0f}" for edge in np.ptp(source.splats.bounds(), axis=0))
-        draw_view(
-            figure.add_subplot(grid[divmod(k, columns)]), f"{source.name}\n{edges} mm", source.splats, TOWARD, unit="m"
-        )
-    canvas.draw()
-    from PIL import Image
-
-    picture = Image.fromarray(np.asarray(canvas.buffer_rgba())[:, :, :3])
-    with whole_file(target, "sheet") as file:
-        picture.save(file, format="png", optimize=True)
+    size = (3.2 * columns, 3.45 * rows)
+    with figure_file(path, size, what="sheet", whole="a sheet of objects", like="presets.png") as figure:
+        grid = figure.add_gridspec(rows, columns, left=0.01, right=0.99, top=1.0 - 0.1 / rows, bottom=0.01, hspace=0.1)
+        for k, config in enumerate(objects):
+            source = object_source(config)
+            edges = " x ".join(f"{1e3 * edge:.0f}" for edge in np.ptp(source.splats.bounds(), axis=0))
+            draw_view(
+                figure.add_subplot(grid[divmod(k, columns)]),
+                f"{source.name}\n{edges} mm",
+                source.splats,
+                TOWARD,
+                unit="m",
+            )

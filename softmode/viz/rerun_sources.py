@@ -56,6 +56,17 @@ class ParameterColumns(Protocol):
         ...
 
 
+class RecordedEpisodes(Protocol):
+    """How the episodes of all worlds go on, as :class:`softmode.envs.episodes.Episodes` tells; each (world_count,)."""
+
+    elapsed: wp.array
+    """Steps of the episode."""
+    reward: wp.array
+    """Reward of the step."""
+    end: wp.array
+    """Why the episode ended, one of `RecordedTask.end_reasons`."""
+
+
 @runtime_checkable
 class RecordedTask(Protocol):
     """A task that runs in worlds of this process, as :class:`softmode.envs.task.Task` does."""
@@ -64,14 +75,10 @@ class RecordedTask(Protocol):
     """Where it happens."""
     table: ParameterColumns
     """What was drawn for each episode."""
-    elapsed: wp.array
-    """Steps of the episode, shape (world_count,)."""
-    reward: wp.array
-    """Reward of the step."""
+    episodes: RecordedEpisodes
+    """How far each episode is, and how it ends."""
     success: wp.array
-    """Whether the task counts as solved."""
-    end: wp.array
-    """Why the episode ended, one of `end_reasons`."""
+    """Whether the task counts as solved, shape (world_count,)."""
     end_reasons: type[IntEnum]
     """RUNNING, TIME_LIMIT, and failures."""
     observation: wp.array
@@ -140,7 +147,7 @@ class TaskSource:
     def __init__(self, task: RecordedTask, world: int, name: str) -> None:
         """Keep the task; ``world`` is the one whose steps count."""
         scene = task.scene
-        if scene.slots > 1:
+        if scene.occupancy.slots > 1:
             hint = "record an environment of one object per world"
             raise ConfigError("a recording cannot follow worlds whose number of objects changes", hint=hint)
         self.name, self.model, self.solver = name, scene.model, scene.solver
@@ -153,7 +160,7 @@ class TaskSource:
         """Return the present state of the task's scene."""
         if state is not None or time is not None:
             raise ConfigError("record of an environment takes no state and no time", hint="call record()")
-        elapsed = int(self.task.elapsed.numpy()[self._world])
+        elapsed = int(self.task.episodes.elapsed.numpy()[self._world])
         self._step += max(elapsed - self._elapsed, 1)
         self._elapsed = elapsed
         scene = self.task.scene
@@ -185,8 +192,8 @@ class TaskSource:
         for name, (columns, _) in task.segments.items():
             found[f"observation/{name}"] = seen[columns].tolist()
         found["metrics/finger_force"] = found["observation/finger_force"]
-        if int(task.elapsed.numpy()[world]) > 0:
-            found["reward/total"] = float(task.reward.numpy()[world])
+        if int(task.episodes.elapsed.numpy()[world]) > 0:
+            found["reward/total"] = float(task.episodes.reward.numpy()[world])
             for k, name in enumerate(task.term_names):
                 found[f"reward/terms/{name}"] = float(task.terms.numpy()[world, k])
             found["action"] = task.scene.actions.numpy()[world].astype(float).tolist()
@@ -195,10 +202,10 @@ class TaskSource:
     def remarks(self, world: int) -> Sequence[tuple[str, str]]:
         """Return begin and end of an episode, and what the solver complains about."""
         task, lines = self.task, list(solver_remarks(self.solver, world))
-        if int(task.elapsed.numpy()[world]) == 0:
+        if int(task.episodes.elapsed.numpy()[world]) == 0:
             drawn = ", ".join(f"{n} {v}" for n, v in self._parameters(world).items())
             lines.append(("INFO", f"episode begins: {drawn}"))
-        reason = task.end_reasons(int(task.end.numpy()[world])).name.lower()
+        reason = task.end_reasons(int(task.episodes.end.numpy()[world])).name.lower()
         if reason != "running":
             lines.append(("INFO" if reason == "time_limit" else "WARN", f"episode ends: {reason}"))
         return lines

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import os
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,10 +12,9 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from softmode.errors import ConfigError, needs_extra
-from softmode.files import whole_file
 from softmode.robots.description import RobotDescription
 from softmode.robots.hand import colliding, settled
+from softmode.viz.figure_file import figure_file
 
 Array = NDArray[np.float64]
 
@@ -40,25 +38,16 @@ def write_robot_picture(path: str | os.PathLike[str], robot: RobotDescription) -
         ConfigError: If the name is not that of a .png.
         StorageError: If it cannot be written.
     """
-    with needs_extra("viz", "the picture of a robot needs matplotlib"):
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-
-    target = Path(path)
-    if target.suffix.lower() != ".png":
-        raise ConfigError(f"picture {target} is no .png file", hint="name it like arm.png")
     model: Any = importlib.import_module("mujoco").MjModel.from_xml_string(robot.mjcf)
     poses = [("home", robot.home_joint_q, False)]
     if robot.gripper is not None:
         poses += [("gripper open", robot.with_opening(1.0), True), ("gripper closed", robot.with_opening(0.0), True)]
-    figure = Figure(figsize=(5.0 * len(poses), 5.2), dpi=100, facecolor="white")
-    canvas = FigureCanvasAgg(figure)
-    for k, (title, joint_q, close) in enumerate(poses):
-        axes = figure.add_axes((k / len(poses), 0.0, 1.0 / len(poses), 0.92))
-        axes.set_title(f"{robot.name}: {title}" if k == 0 else title, fontsize=11)
-        _draw(axes, robot, model, joint_q, robot.hand_links if close else robot.link_names)
-    with whole_file(target, "picture") as stream:
-        canvas.print_png(stream)
+    size = (5.0 * len(poses), 5.2)
+    with figure_file(path, size, what="picture", whole="the picture of a robot", like="arm.png") as figure:
+        for k, (title, joint_q, close) in enumerate(poses):
+            axes = figure.add_axes((k / len(poses), 0.0, 1.0 / len(poses), 0.92))
+            axes.set_title(f"{robot.name}: {title}" if k == 0 else title, fontsize=11)
+            _draw(axes, robot, model, joint_q, robot.hand_links if close else robot.link_names)
 
 
 def _draw(axes: Any, robot: RobotDescription, model: Any, joint_q: Array, links: Sequence[str]) -> None:

@@ -10,7 +10,9 @@ import pytest
 import warp as wp
 from scipy.linalg import polar
 
-from softmode.deformables.skinning.skin_splats import STRETCH_LIMIT, SkinSplats, average_basis
+from softmode.deformables.skinning import averages
+from softmode.deformables.skinning.averages import average_basis
+from softmode.deformables.skinning.skin_splats import STRETCH_LIMIT, SkinSplats
 from softmode.deformables.skinning.skinning_kernels import vec6
 from softmode.errors import BasisError
 from softmode.splats.splats import rotations_from_quats
@@ -255,6 +257,36 @@ def test_averages_of_quadratic_functions_are_exact() -> None:
     mixed = average_basis(functions(float(np.median(width))), case.means, case.covariances)
     np.testing.assert_array_equal(mixed[0][narrow], values(case.means)[narrow])
     np.testing.assert_array_equal(mixed[0][~narrow], basis[~narrow])
+
+
+def test_averages_of_many_splats_are_those_of_each(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a grid a quadratic function keeps its averages to rounding, and at a step the error is bounded."""
+    rng = np.random.default_rng(1)
+    means = rng.uniform(-0.04, 0.04, (500, 3))
+    scales = rng.uniform(2e-4, 3e-3, (500, 3))
+    covariances = scales[:, :, None] ** 2 * np.eye(3)
+    slope = np.array([[1.0, 0.0, 0.0], [0.0, 0.5, -1.0]])
+
+    def values(x: np.ndarray) -> np.ndarray:
+        step = 0.02 * np.tanh(x[:, :1] / 1e-4)
+        return np.concatenate([x @ slope.T + 5.0 * (x * x) @ slope.T, step], axis=1)
+
+    def evaluate(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        smooth = slope + 10.0 * slope * x[:, None]
+        step = 200.0 / np.cosh(np.clip(x[:, None, :1] / 1e-4, -300.0, 300.0)) ** 2 * np.array([1.0, 0.0, 0.0])
+        return values(x), np.concatenate([smooth, step], axis=1)
+
+    functions = SimpleNamespace(values=values, evaluate=evaluate, narrow=2e-3)
+    told: list[float] = []
+    each = average_basis(functions, means, covariances)
+    monkeypatch.setattr(averages, "MANY", 500)
+    grid = average_basis(functions, means, covariances, progress=told.append)
+    np.testing.assert_allclose(grid[0][:, :2], each[0][:, :2], atol=1e-7)
+    np.testing.assert_allclose(grid[1][:, :2], each[1][:, :2], atol=2e-4)
+    beside = np.abs(means[:, 0]) < 1e-3
+    bound = averages.TOLERANCE * np.sqrt(np.mean(each[1] ** 2))
+    np.testing.assert_allclose(grid[1][beside], each[1][beside], rtol=0.0, atol=bound)
+    assert told == sorted(told) and told[-1] == pytest.approx(1.0)
 
 
 def test_average_of_a_step_is_bounded_by_its_height() -> None:

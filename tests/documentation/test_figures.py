@@ -69,7 +69,8 @@ def test_page_of_figures_is_up_to_date() -> None:
 def test_figures_say_where_they_come_from() -> None:
     """A figure has a question, a value, a date, a machine, a commit and a command."""
     for name, figure in FIGURES.items():
-        assert set(figure) == {"what", "value", "unit", "date", "machine", "commit", "command"}, name
+        assert set(figure) == {"what", "value", "unit", "date", "machine", "commit", "command", "of"}, name
+        assert figure["of"] in ("run", "row"), name
         assert re.fullmatch(r"\d{4}-\d\d-\d\d", figure["date"]), name
         assert figure["what"] and str(figure["value"]) and figure["machine"] and figure["command"], name
         assert re.fullmatch(r"[0-9a-f]{7,}\+?", figure["commit"]), name
@@ -96,4 +97,4 @@ def test_a_record_renews_what_is_public(tmp_path: Path) -> None:
     record("step", {"beam": 1.5, "other": 3.0}, folder=tmp_path)
     (name, found), *others = json.loads((tmp_path / "step.json").read_text()).items()
     assert not others and (name, found["value"], found["what"], found["unit"]) == ("beam", 1.5, "a step", "ms")
-    assert all(found[key] for key in ("date", "machine", "commit", "command"))
+    assert all(found[key] for key in ("date", "machine", "commit", "command")) and found["of"] == "run"

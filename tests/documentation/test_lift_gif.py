@@ -15,9 +15,10 @@ pytest.importorskip("imageio_ffmpeg", reason="needs the extra [demo]")
 Image = pytest.importorskip("PIL.Image", reason="needs the extra [demo]")
 
 
-def test_the_committed_picture() -> None:
-    """It is smaller than 2 MB, loops, and its last frame differs from the first: the bear is up."""
-    path = ROOT / "docs" / "images" / "lift.gif"
+@pytest.mark.parametrize("name", ["lift", "playbot", "presets", "press"])
+def test_the_committed_picture(name: str) -> None:
+    """It is smaller than 2 MB, loops, and its last frame differs from the first: the object is elsewhere."""
+    path = ROOT / "docs" / "images" / f"{name}.gif"
     assert path.stat().st_size < 2e6
     with Image.open(path) as picture:
         assert picture.info["loop"] == 0 and picture.n_frames > 20

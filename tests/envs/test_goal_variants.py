@@ -26,7 +26,7 @@ def test_goals_are_places(make_env: MakeEnv, name: str) -> None:
     """
     env: Any = make_env(f"{name}Goal").unwrapped
     plain: Any = make_env(name).unwrapped
-    size = env.goal_size
+    size = env.task_class.goal_size
     given, _ = env.reset(seed=3)
     other, _ = plain.reset(seed=3)
     env.action_space.seed(3)
@@ -57,11 +57,11 @@ def test_rewards_are_computed_again(soft_env: MakeEnv, name: str) -> None:
         apart = np.linalg.norm(seen["achieved_goal"].astype(float) - seen["desired_goal"])
         assert reward == pytest.approx(-apart, rel=1e-5) and reward == info["reward_terms"]["goal"]
         assert reward == env.compute_reward(seen["achieved_goal"], seen["desired_goal"], info)
-    a, g = np.random.default_rng(0).uniform(-0.3, 0.3, (2, 4, 5, env.goal_size)).astype(np.float32)
+    a, g = np.random.default_rng(0).uniform(-0.3, 0.3, (2, 4, 5, env.task_class.goal_size)).astype(np.float32)
     rewards = env.compute_reward(a, g, None)
     assert rewards.shape == (4, 5)
     np.testing.assert_allclose(rewards, -np.linalg.norm(a.astype(float) - g, axis=-1), rtol=1e-5)
-    with pytest.raises(ConfigError, match=str(env.goal_size)):
+    with pytest.raises(ConfigError, match=str(env.task_class.goal_size)):
         env.compute_reward(a[..., :1], g[..., :1])
     torch = pytest.importorskip("torch")
     np.testing.assert_array_equal(env.compute_reward(torch.tensor(a), torch.tensor(g)).numpy(), rewards)

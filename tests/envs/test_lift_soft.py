@@ -15,8 +15,10 @@ from gymnasium.utils.env_checker import data_equivalence
 
 import softmode
 from softmode.deformables.model.status import status_reasons
+from softmode.envs.task import plan_of
 from softmode.envs.task_kernels import bound_observation
 from softmode.envs.tasks.lift_soft.task import LiftSoftConfig, LiftSoftEnv
+from softmode.envs.tasks.press_soft import kernels as press_kernels
 from softmode.errors import ConfigError, MaterialError
 from softmode.pause import collector_paused
 from tests.envs.conftest import MakeEnv
@@ -209,7 +211,7 @@ def test_large_actions_are_clamped(lift: LiftSoftEnv) -> None:
     "given",
     [
         {"obs_type": "depth"},
-        {"render_mode": "human"},
+        {"render_mode": "ansi"},
         {"control_mode": "torque"},
         {"size": 0.0},
         {"config": {"image_size": 128}},
@@ -333,18 +335,24 @@ def test_an_object_off_the_table_ends_the_episode(lift: LiftSoftEnv) -> None:
     assert lift.observation_space.contains(observation)
 
 
+def test_kernels_ask_for_what_a_task_has(lift: LiftSoftEnv) -> None:
+    """A field of a plan that is no parameter, segment or attribute is named."""
+    with pytest.raises(ConfigError, match="'drawn_goal_force', which nothing has"):
+        plan_of(lift.task, press_kernels.observe)
+
+
 def test_numbers_beyond_the_bounds_are_clipped(lift: LiftSoftEnv) -> None:
     """Whatever the scene holds, the observation lies in its space; NaN becomes zero."""
     task = lift.task
     wild = np.full(task.observation.shape, np.nan, np.float32)
     wild[0, ::2] = 1.0e30
     wild[0, 1] = -np.inf
-    low, high = (wp.array(bound, dtype=float) for bound in (task.low, task.high))
+    low, high = (wp.array(bound, dtype=float) for bound in (task.layout.low, task.layout.high))
     seen, finite = wp.array(wild, dtype=float), wp.zeros(1, dtype=wp.bool)
     wp.launch(bound_observation, dim=1, inputs=[low, high], outputs=[seen, finite])
     assert lift.observation_space.contains(seen.numpy()[0]) and not finite.numpy()[0]
-    np.testing.assert_array_equal(seen.numpy()[0, 1::2], np.clip(0.0, task.low, task.high)[1::2])
-    np.testing.assert_array_equal(seen.numpy()[0, ::2], task.high[::2])
+    np.testing.assert_array_equal(seen.numpy()[0, 1::2], np.clip(0.0, task.layout.low, task.layout.high)[1::2])
+    np.testing.assert_array_equal(seen.numpy()[0, ::2], task.layout.high[::2])
 
 
 @pytest.mark.parametrize("modulus", [2.0e4, 2.0e6])

@@ -12,7 +12,7 @@ import pytest
 import softmode  # noqa: F401  (registers the environments)
 from softmode.deformables.model.status import WORLD_COLLAPSED, WORLD_ITERATION_LIMIT, WORLD_PENETRATION
 from softmode.deformables.reduction.options import BuildOptions
-from softmode.envs.end_reason import EndReason
+from softmode.envs.reward_kernels import EndReason
 from softmode.envs.scripted import scripted_policy
 from softmode.envs.tasks.place_in_bin.scripted import ScriptedPlace
 from softmode.envs.tasks.place_in_bin.task import Bin, PlaceInBinConfig, PlaceInBinEnv, bin_scene
@@ -104,7 +104,8 @@ def test_observation_says_where_bin_and_others_are(env: PlaceInBinEnv) -> None:
     np.testing.assert_allclose(seen(env, observation, "object_goal"), rim - toy, atol=1e-6)
     np.testing.assert_allclose(seen(env, observation, "other_offsets"), (others - toy).ravel(), atol=1e-6)
     assert info["bin_distance"] == pytest.approx(np.hypot(0.0, 0.14 - 0.08 + 0.12), abs=1e-4)
-    assert env.task.column("goal") < env.task.agent_size == env.task.column("object_position")
+    layout = env.task.layout
+    assert layout.column("goal") < layout.agent_size == layout.column("object_position")
 
 
 def test_reward_is_the_sum_of_its_terms(env: PlaceInBinEnv) -> None:

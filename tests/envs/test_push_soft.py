@@ -65,8 +65,10 @@ def test_observation_says_where_to_go(push: PushSoftEnv) -> None:
     behind = np.array([*(centre[:2] - push.task.push_distance * towards), push.task.push_height])
     np.testing.assert_allclose(seen(push, observation, "push_offset"), behind - tool, atol=1e-6)
     assert info["goal_distance"] == pytest.approx(0.12, abs=1e-3) and info["yaw_error"] == pytest.approx(0.3, abs=1e-5)
-    ahead = push.task.agent_size
-    assert push.task.column("object_position") == ahead and push.task.column("goal") < ahead  # pixels see no object
+    ahead = push.task.layout.agent_size
+    assert (
+        push.task.layout.column("object_position") == ahead and push.task.layout.column("goal") < ahead
+    )  # pixels see no object
 
 
 def test_goals_stay_within_their_range(push: PushSoftEnv) -> None:

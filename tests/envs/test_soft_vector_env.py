@@ -11,7 +11,7 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 from softmode.deformables.model import status as bits
-from softmode.envs.end_reason import EndReason
+from softmode.envs.reward_kernels import EndReason
 from softmode.envs.scripted import scripted_policy
 from softmode.envs.soft_vector_env import SoftVectorEnv
 from softmode.envs.tasks.lift_soft.task import LiftSoftConfig, LiftSoftEnv

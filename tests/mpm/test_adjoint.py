@@ -11,7 +11,8 @@ import warp as wp
 from softmode.deformables import Material
 from softmode.deformables.materials.material_kernels import MaterialModel
 from softmode.errors import ConfigError
-from softmode.mpm import CoarseMassLoss, MassLoss, MpmOptions, MpmSimulation, position_loss
+from softmode.mpm import MassLoss, MpmOptions, MpmSimulation, PlaceLoss, position_loss
+from softmode.mpm.places import transported
 from tests.mpm.scenes import ball, moving, torus
 
 
@@ -142,25 +143,32 @@ def test_mass_loss_by_the_target(kind: str) -> None:
     assert (ends[0] - ends[1]) / 2e-5 == pytest.approx((by_x * dx).sum() + by_m @ dm, rel=1e-6)
 
 
-def test_coarse_losses_are_added() -> None:
-    """The gradient of the sum is that of differences; a weight of 0 leaves the fine loss to the bit."""
+def test_places_are_added() -> None:
+    """The gradient of the sum is that of differences; weights of 0 leave the loss of masses to the bit."""
     options = MpmOptions(precision="float64")
     s, target = moving(ball(2.2), options, step_count=3), torus(2.5, 1.2)
-    fine = MassLoss(options.grid, target, dtype=wp.float64, device="cpu")
-    levels = [CoarseMassLoss(fine, s, target, factor=factor) for factor in (2, 4)]
+    fine, places = MassLoss(options.grid, target, dtype=wp.float64, device="cpu"), PlaceLoss(s)
     value = wp.zeros(1, dtype=wp.float64, device="cpu")
 
     def evaluate() -> float:
         s.forward()
         fine.after(s, value)
-        for level in levels:
-            level.add(s, value)
+        places.add(value)
         return float(value.numpy()[0])
 
-    total = evaluate()
-    first, parameters = fine.gradient(s, levels)
-    bars = {"x": first.x.numpy().copy(), "mass": parameters.mass.numpy().copy()}
     rng = np.random.default_rng(6)
+    places.place(options.grid, target)
+    places.aim(s.first.x.numpy() + rng.standard_normal((1, s.count, 3)))
+    values = []
+    for weights in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0)):
+        places.weigh(*weights)
+        values.append(evaluate())
+    assert values[0] == loss_of(s, fine)
+    assert values[0] < min(values[1:3])
+    assert values[1] + values[2] - values[0] == pytest.approx(values[3], rel=1e-12)
+    evaluate()
+    first, parameters = fine.gradient(s, places)
+    bars = {"x": first.x.numpy().copy(), "mass": parameters.mass.numpy().copy()}
     for name, array in (("x", s.first.x), ("mass", s.mass)):
         start, along = array.numpy().copy(), rng.standard_normal(array.numpy().shape)
         ends = []
@@ -169,9 +177,19 @@ def test_coarse_losses_are_added() -> None:
             ends.append(evaluate())
         array.assign(start)
         assert (ends[0] - ends[1]) / 2e-5 == pytest.approx((bars[name] * along).sum(), rel=1e-5), name
-    for level in levels:
-        level.weigh(0.0)
-    assert evaluate() == loss_of(s, fine) < 0.9 * total
+
+
+def test_places_of_transport() -> None:
+    """A ball that is carried to one elsewhere keeps its shape; masses may differ."""
+    grid = MpmOptions().grid
+    here, there = ball(2.2), ball(2.2).moved(np.array([4.0, -3.0, 2.0]))
+    masses = []
+    for body, factor in ((here, 1.0), (there, 2.0)):
+        loss = MassLoss(grid, replace(body, masses=factor * body.masses), dtype=wp.float64, device="cpu")
+        masses.append(loss.target_mass.numpy()[0])
+    found = transported(here.positions, *masses, grid)
+    assert np.abs(found - there.positions).max() < 0.5
+    assert found.mean(axis=0) == pytest.approx(there.positions.mean(axis=0), abs=1e-3)
 
 
 def test_symmetric_loss() -> None:

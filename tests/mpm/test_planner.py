@@ -20,11 +20,11 @@ from tests.mpm.scenes import ball, torus
 
 
 def test_ball_becomes_a_torus() -> None:
-    """With an eighth of the paper's particles 60 frames take 60 % of the loss and 100 frames 75 %, always falling."""
+    """With an eighth of the paper's particles 100 frames take 80 % of the loss, the first 60 half of it."""
     run = morph(ball(6.93, 1.0), torus(7.0, 3.2, 1.0), MorphOptions(frame_count=100), device="cpu")
     assert (np.diff(run.losses) < 0.0).all()
-    assert 1.0 - run.losses[6] / run.losses[0] >= 0.6
-    assert run.accuracy > 0.75
+    assert 1.0 - run.losses[6] / run.losses[0] >= 0.5
+    assert run.accuracy > 0.8
     assert run.positions.shape == (11, ball(6.93, 1.0).count, 3)
 
 
@@ -181,7 +181,7 @@ def test_several_targets_in_a_row() -> None:
     assert run.ends == (2, 4)
     assert run.legs.tolist() == [0] * 2 + [1] * 2
     assert (np.diff(run.losses[:3]) < 0.0).all()
-    assert run.losses[3] < run.first_losses[1]
+    assert run.losses[4] < run.first_losses[1]
     alone = MorphPlanner(ball(2.9), torus(3.5, 1.4), MorphOptions(frame_count=20), device="cpu").run()[0]
     assert np.array_equal(alone.positions, run.positions[:3])
     assert np.array_equal(alone.deformation, run.deformation[:3])

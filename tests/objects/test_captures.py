@@ -17,8 +17,7 @@ from softmode.deformables.reduction.options import BuildOptions
 from softmode.deformables.reduction.report import object_findings, report_body
 from softmode.errors import AssetError
 from softmode.objects import ObjectConfig, load
-from softmode.objects.loader import object_config
-from softmode.objects.object_build import build_object
+from softmode.objects.loader import build_object, object_config
 from softmode.objects.pipeline import standing_quadrature
 from softmode.objects.source import object_source
 from softmode.splats.colored_mesh import ColoredMesh

@@ -169,6 +169,21 @@ ARM5 = _ARM5.format(jaws=_JAWS.format(knuckle=""), tendon=_TENDON, servo=_SERVO,
 """An arm of five joints whose gripper hangs on one soft servo; no link has a usual name, no equality ties the jaws."""
 
 
+_ONE_JAW = """
+                <geom type="box" size="0.01 0.004 0.04" pos="0 -0.004 0.06" mass="0.05"/>
+                <body name="jaw" pos="0 0 0.02">
+                  <joint name="jaw" axis="-1 0 0" range="0 1" armature="0.001" damping="0.01"/>
+                  {shape}
+                </body>"""
+_BOX = '<geom type="box" size="0.01 0.004 0.04" pos="0 0.004 0.04" mass="0.05"/>'
+
+
+def one_jaw(shape: str = _BOX) -> str:
+    """Return the arm of five joints with a jaw 80 mm long that turns against a fixed one, both of boxes."""
+    servo = """<position joint="jaw" kp="10" kv="0.5" forcerange="-5 5"/>"""
+    return _ARM5.format(jaws=_ONE_JAW.format(shape=shape), tendon="", servo=servo, opening=" 0.5")
+
+
 def write_arm5(folder: Path, text: str = ARM5) -> Path:
     """Write the arm of five joints; return its path."""
     path = folder / "arm5.xml"

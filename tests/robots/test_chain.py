@@ -17,7 +17,7 @@ from softmode.robots.chain import serial_chain
 from softmode.robots.control import ArmControlOptions
 from softmode.robots.robot_control import RobotController
 from softmode.robots.table_robot import TableRobot, finger_links
-from tests.robots.files import ARM5, write_arm5, write_mjcf
+from tests.robots.files import ARM5, one_jaw, write_arm5, write_mjcf
 
 
 @pytest.fixture(scope="module")
@@ -172,6 +172,19 @@ def test_opening_follows_the_command(placed: TableRobot) -> None:
     assert rig.controller.opening.numpy()[0] == pytest.approx(-1.05 * 2.0 * 0.01, rel=0.02)
 
 
+def test_tool_stays_between_a_jaw_and_the_fixed_one(tmp_path: Path) -> None:
+    """As the jaw closes by 30 mm the tool stays, and the link with the fixed jaw comes nearer by half of that."""
+    placed = robots.place_robot(robots.load(write_arm5(tmp_path, one_jaw())))
+    assert placed.jaw.follow in (0.5, -0.5)
+    rig, chain = Driven(placed), serial_chain(placed.robot)
+    before = rig.controller.tool_pose.numpy()[0, :3]
+    hand = chain.forward(rig.controller.commanded_q.numpy()[:1, :5])[0]
+    rig.act([0.0, 0.0, 0.0, 0.0, -1.0], count=5)
+    np.testing.assert_allclose(rig.controller.tool_pose.numpy()[0, :3], before, atol=1e-3)
+    moved = chain.forward(rig.controller.commanded_q.numpy()[:1, :5])[0] - hand
+    assert np.linalg.norm(moved) == pytest.approx(0.5 * 5 * 0.006, abs=1e-3)
+
+
 def test_steps_of_the_joints(placed: TableRobot) -> None:
     """Joint steps move every joint by the scale, within limits; the action has a number per joint and the gripper."""
     rig = Driven(placed, "joint_delta")
@@ -193,3 +206,12 @@ def test_robots_that_do_not_fit(tmp_path: Path) -> None:
     short = write_arm5(tmp_path, ARM5.replace("0.35", "0.04"))
     with pytest.raises(ConfigError, match="finds no place"):
         robots.place_robot(robots.load(short))
+
+
+def test_the_search_for_a_base_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It counts the poses that it tries, the same on every machine; the error says when they are spent."""
+    robot = robots.load(write_arm5(tmp_path))
+    assert 0.0 < robots.place_robot(robot, ranges=(0.4, 0.5)).share < 1.0
+    monkeypatch.setattr("softmode.robots.table_robot._POSES", 10)
+    with pytest.raises(ConfigError, match="in the 10 poses that are tried"):
+        robots.place_robot(robot, ranges=(0.4, 0.5))

@@ -19,7 +19,7 @@ from softmode.errors import AssetError, ConfigError
 from softmode.robots import ParallelJaw
 from softmode.robots.chain import serial_chain
 from softmode.robots.hand import colliding
-from tests.robots.files import write_arm5
+from tests.robots.files import ARM5, write_arm5
 
 INERTIA = '<inertial><mass value="0.3"/><inertia ixx="1e-3" iyy="1e-3" izz="1e-3" ixy="0" ixz="0" iyz="0"/></inertial>'
 BOX = '<geometry><box size="0.05 0.008 0.02"/></geometry>'
@@ -161,6 +161,15 @@ def test_what_is_left_out_is_said(tmp_path: Path) -> None:
     urdf.write_text(urdf.read_text().replace('effort="20"', 'effort="0"'))
     said = "\n".join(robots.load(urdf).notes)
     assert "empty range" in said and "effort 0" in said
+
+
+def test_limits_upside_down_are_refused(tmp_path: Path) -> None:
+    """MuJoCo takes them for none; a URDF with an attribute of another program is read."""
+    with pytest.raises(AssetError, match="lower limit 2 above the upper one -2"):
+        robots.load(write_arm5(tmp_path, ARM5.replace('range="-2 2"', 'range="2 -2"')))
+    urdf = write(tmp_path)
+    urdf.write_text(urdf.read_text().replace("<limit", '<limit drake:acceleration="2"'))
+    assert robots.load(urdf).gripper is not None
 
 
 def test_low_arms_stand_on_a_pedestal(tmp_path: Path) -> None:

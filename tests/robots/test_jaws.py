@@ -6,11 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from softmode import robots
 from softmode.errors import ConfigError, GraspError
 from softmode.robots import ArmDescription, GripperDescription, ParallelJaw, plan_grasps
-from tests.robots.files import write_arm_and_gripper, write_mjcf, write_urdf
+from softmode.robots.jaws import gap_of, measured
+from tests.robots.files import one_jaw, write_arm5, write_arm_and_gripper, write_mjcf, write_urdf
 from tests.robots.test_grasp_planner import block, check
 
 
@@ -72,8 +74,43 @@ def test_jaw_of_the_aloha_arm_plans_a_grasp() -> None:
         plan_grasps(*block((0.07, 0.07, 0.07)), jaw)
 
 
-@pytest.mark.parametrize(("gripper", "words"), [({}, "0 driven fingers"), ({"left": (0.0, 0.04)}, "1 driven fingers")])
+def test_jaw_that_turns_against_a_fixed_one(tmp_path: Path) -> None:
+    """Its gap is that 20 mm behind the tips, 60 mm from the hinge: 60 mm tan q, until the tip has come up by as much.
+
+    The middle of the pads stands off the fixed face by half of the gap.
+    """
+    robot = robots.load(write_arm5(tmp_path, one_jaw()))
+    assert robot.end_effector == "roll" and robot.gripper is not None and robot.gripper.joints == ("jaw",)
+    assert any("'jaw' closes" in note for note in robot.notes)
+    grasping, jaw = measured(robot)
+    assert grasping.gripper is not None
+    last = grasping.gripper.open[0]
+    assert np.cos(last) * 0.08 >= 0.06 > np.cos(last + 1.0 / 40.0) * 0.08
+    for opening in (0.0, 0.4, 1.0):
+        assert gap_of(grasping, jaw, opening) == pytest.approx(0.06 * np.tan(opening * last), abs=1e-9)
+    np.testing.assert_allclose(jaw.frame[:3], (0.0, 0.0, 0.09), atol=1e-9)
+    np.testing.assert_allclose(np.subtract(jaw.frame_at(0.04)[:3], jaw.frame[:3]), (0.0, 0.02, 0.0), atol=1e-9)
+
+
+def test_mesh_that_fills_the_jaw_is_cut(tmp_path: Path) -> None:
+    """A jaw with a foot that reaches over to the fixed one: its hull would leave no opening, that of slabs does.
+
+    The slab of 10 mm that holds the foot ends below the pads, whose gap is that of the jaw alone.
+    """
+    jaw = trimesh.creation.box((0.02, 0.008, 0.08), trimesh.transformations.translation_matrix((0.0, 0.004, 0.04)))
+    foot = trimesh.creation.box((0.02, 0.06, 0.009), trimesh.transformations.translation_matrix((0.0, -0.02, 0.0045)))
+    trimesh.util.concatenate([jaw, foot]).export(tmp_path / "jaw.stl")
+    text = one_jaw('<geom type="mesh" mesh="jaw" mass="0.05"/>').replace(
+        "<worldbody>", '<asset><mesh name="jaw" file="jaw.stl"/></asset><worldbody>'
+    )
+    robot = robots.load(write_arm5(tmp_path, text))
+    assert any("cut into 8 hulls" in note for note in robot.notes)
+    assert robot.model.body("jaw").mass[0] == pytest.approx(0.05)
+    assert 0.9 * 0.06 * np.tan(0.7) < measured(robot)[1].opening < 1.1 * 0.06 * np.tan(0.75)
+
+
+@pytest.mark.parametrize(("gripper", "words"), [({}, "0 driven fingers"), ({"left": (0.0, 0.04)}, "opens 0 mm at its")])
 def test_other_grippers_are_refused(gripper: dict[str, tuple[float, float]], words: str, tmp_path: Path) -> None:
-    """No gripper, or one finger, is no parallel gripper."""
+    """No gripper, or one finger without a fixed one, is no parallel gripper."""
     with pytest.raises(ConfigError, match=words):
         ParallelJaw.of(robots.load(write_mjcf(tmp_path), gripper=gripper))

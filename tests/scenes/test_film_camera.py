@@ -155,7 +155,7 @@ def test_the_following_camera_does_not_jerk() -> None:
                 assert (np.abs(seen[:2]) + radius < 0.5 * EDGE / CAMERA.fx * seen[2]).all()
     move = np.diff(places, axis=0)
     assert np.abs(move[:28]).max() == 0.0
-    rate = 2.0 / FollowCamera.SECONDS
+    rate = 2.0 / follow.seconds
     assert np.abs(np.diff(move, axis=0)).max() < (rate * step) ** 2 * 0.25
     again = follow.matrices(np.array([[[0.0, 0.0, 0.05, 0.05], [0.0, 0.0, 0.2, 0.07]]]), np.zeros(1))[0]
     np.testing.assert_allclose(-again[:3, :3].T @ again[:3, 3], places[0], atol=1e-12)

@@ -57,6 +57,20 @@ def test_kinetic_energy_of_free_fall_is_the_work_of_gravity(cube: SoftObject) ->
     np.testing.assert_allclose(moved, (0.0, 0.0, -GRAVITY * DT**2 * 8 * 9 / 2), atol=1e-6)
 
 
+def test_what_starts_inside_is_said(cube: SoftObject, caplog: pytest.LogCaptureFixture) -> None:
+    """Cubes 20 mm in each other, one of them 5 mm in the ground, are named with depth and place; apart nothing is."""
+    with caplog.at_level("WARNING", "softmode"):
+        apart = make_scene(cube, (0.0, 0.0, 0.03), (0.2, 0.0, 0.03))
+        apart.step()
+        assert not apart.notes and not caplog.records
+        scene = make_scene(cube, (0.0, 0.0, 0.03), (0.04, 0.0, 0.025))
+        scene.step()
+    ground = next(note for note in scene.notes if "ground_plane" in note)
+    assert "soft body 1" in ground and "starts 5.0 mm deep" in ground and "-0.005) m" in ground
+    assert any(note.startswith("soft body 0") and "deep in soft body 1" in note for note in scene.notes)
+    assert [note for note in scene.notes if note in caplog.text] == list(scene.notes)
+
+
 def test_pushed_samples_carry_the_weight(cube: SoftObject) -> None:
     """Forces on the surface that sum to the weight keep a cube at rest where it hangs; without them it falls."""
     scene = make_scene(cube, (0.0, 0.0, 1.0), steps_per_frame=4)

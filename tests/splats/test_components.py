@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from softmode.errors import ConfigError
 from softmode.splats import Splats, make_plush, read_splats, split_components
-from tests.splats.test_formats import PLAYBOT
 
 
 def merged(*parts: Splats) -> Splats:
@@ -41,11 +41,9 @@ def test_haze_joins_nothing_and_goes_with_the_nearest() -> None:
     assert len(split_components(merged(toy, bridge, other), gap=0.008, min_opacity=0.01)) == 1
 
 
-def test_playbot_is_ground_robot_and_two_hands() -> None:
+def test_playbot_is_ground_robot_and_two_hands(playbot: Path) -> None:
     """The trained asset holds a patch of ground, the robot above it and its two floating hands."""
-    if not PLAYBOT.is_file():
-        pytest.skip("the playbot asset is not beside this checkout")
-    parts = split_components(read_splats(PLAYBOT).oriented("-y"))
+    parts = split_components(read_splats(playbot).oriented("-y"))
     robot = max(parts, key=lambda part: np.ptp(part.means[:, 2]))
     low, high = robot.bounds(quantile=0.01)
     assert robot.count > 1500 and low[2] > 0.1 and high[2] - low[2] > 0.7

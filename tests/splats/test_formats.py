@@ -17,7 +17,6 @@ from softmode.splats import Splats, read_splats, write_ply
 from tests.splats.test_splats import random_splats
 
 FLOAT32 = np.finfo(np.float32).eps
-PLAYBOT = Path(__file__).parents[2] / "../shared/data/splats/playbot/4_0/meta.json"
 
 
 def ply_bytes(tmp_path: Path, **kwargs: Any) -> bytes:
@@ -258,11 +257,9 @@ def test_sog_refuses_a_decompression_bomb(tmp_path: Path) -> None:
         read_splats(write_sog(tmp_path / "sog", meta, images | {"scales.webp": bytes(bomb)}))
 
 
-def test_playbot() -> None:
+def test_playbot(playbot: Path) -> None:
     """The trained robot asset: 8,406 splats of degree 2, y down, on a patch of ground."""
-    if not PLAYBOT.is_file():
-        pytest.skip("the playbot asset is not beside this checkout")
-    splats = read_splats(PLAYBOT)
+    splats = read_splats(playbot)
     assert splats.count == 8406 and splats.sh_degree == 2
     upright = splats.oriented("-y")
     low, high = upright.bounds()

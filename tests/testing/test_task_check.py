@@ -34,7 +34,7 @@ class Secretive(PressSoft):
     def observe(self) -> None:
         """Write it over the goal."""
         super().observe()
-        self.launch(write_secret, [self.secret, self.column("goal_force")], [self.observation])
+        self.launch(write_secret, [self.secret, self.layout.column("goal_force")], [self.observation])
 
 
 class BrokenEnv(PressSoftEnv):

@@ -37,7 +37,7 @@ _COPIES = np.array([1, 1, 1, 1, 1, 2, 2, 1, 2, 1], dtype=np.float64)
 
 @dataclass(frozen=True, kw_only=True)
 class BasisQGMLS:
-    """Value, gradient and second derivatives of the ten functions of every kernel, float64."""
+    """Value and gradient of the ten functions of every kernel, float64."""
 
     centres: Array
     """Centres X_i [m], shape (n, 3)."""
@@ -73,40 +73,6 @@ class BasisQGMLS:
         Raises:
             BasisError: If points are not finite, or no kernel covers one.
         """
-        value, gradient, _ = self._evaluate(points, second=False)
-        return value, gradient
-
-    def second_derivatives(self, points: ArrayLike) -> Array:
-        """Return the second derivatives [1/m^2] (N, 10 n, 3, 3) at points (N, 3) [m]; errors as `evaluate`."""
-        return self._evaluate(points, second=True)[2]
-
-    def coordinates(self, value: ArrayLike, gradient: ArrayLike, second: ArrayLike) -> Array:
-        """Return the coefficients of a field from what it is at the centres; quadratic fields come out exactly.
-
-        Args:
-            value: Values, shape (n,).
-            gradient: Gradients [1/m], shape (n, 3).
-            second: Second derivatives [1/m^2], shape (n, 3, 3).
-
-        Returns:
-            Coefficients u with field(X) = evaluate(X)[0] @ u, shape (10 n,).
-        """
-        bent = np.stack([np.asarray(second)[:, a, b] for a, b in _PAIRS], axis=1)
-        columns = (np.asarray(value)[:, None], self.length * np.asarray(gradient), self.length**2 * bent)
-        return np.concatenate(columns, axis=1).ravel()
-
-    @cached_property
-    def _functionals(self) -> tuple[Array, Array]:
-        """p_,f at the centres (n, 10, 10), and the bracket of G (n, 100)."""
-        at = (self.centres - self.centres.mean(axis=0)) / self.length
-        second = np.stack([_CURVED[a, b] for a, b in _PAIRS])
-        found = np.concatenate(
-            [_monomials(at)[:, None], _slopes(at), np.broadcast_to(second, (len(at), *second.shape))], axis=1
-        )
-        return found, np.einsum("nfa,f,nfb->nab", found, _COPIES, found).reshape(len(at), -1)
-
-    def _evaluate(self, points: ArrayLike, *, second: bool) -> tuple[Array, Array, Array]:
-        """Return values, gradients and, if asked for, second derivatives."""
         X = np.asarray(points, dtype=np.float64)
         if X.ndim != 2 or X.shape[1] != 3 or not np.isfinite(X).all():
             raise BasisError(f"points: expected finite positions of shape (N, 3), got shape {X.shape}")
@@ -133,18 +99,17 @@ class BasisQGMLS:
         fy, fdy = np.einsum("nfa,pa->pnf", scaled, y), np.einsum("nfa,pda->pnfd", scaled, dy)
         value = (w[:, :, None] * fy).reshape(len(X), -1)
         slope = w[:, :, None, None] * fdy + fy[..., None] * dw.transpose(0, 2, 1)[:, :, None]
-        gradient = slope.reshape(len(X), -1, 3) / unit
-        if not second:
-            return value, gradient, np.zeros((0, 0, 3, 3))
-        outer = (24.0 * rest / radius**4 * scale[:, None])[..., None, None] * away[..., None] * away[..., None, :]
-        ddw = outer - (6.0 * rest**2 / radius**2 * scale[:, None])[..., None, None] * np.eye(3)  # (N, n, 3, 3)
-        ddG = np.einsum("pnde,nk->pdek", ddw, bracket).reshape(len(X), 3, 3, FUNCTIONS, FUNCTIONS)
-        crossed = np.einsum("pdab,peb->pdea", dG, dy)
-        right = _CURVED - crossed - crossed.transpose(0, 2, 1, 3) - np.einsum("pdeab,pb->pdea", ddG, y)
-        fddy = np.einsum("nfa,pdea->pnfde", scaled, np.einsum("pab,pdeb->pdea", inverse, right))
-        mixed = dw.transpose(0, 2, 1)[:, :, None, :, None] * fdy[..., None, :]
-        bent = ddw[:, :, None] * fy[..., None, None] + mixed + mixed.swapaxes(3, 4) + w[:, :, None, None, None] * fddy
-        return value, gradient, bent.reshape(len(X), -1, 3, 3) / unit**2
+        return value, slope.reshape(len(X), -1, 3) / unit
+
+    @cached_property
+    def _functionals(self) -> tuple[Array, Array]:
+        """p_,f at the centres (n, 10, 10), and the bracket of G (n, 100)."""
+        at = (self.centres - self.centres.mean(axis=0)) / self.length
+        second = np.stack([_CURVED[a, b] for a, b in _PAIRS])
+        found = np.concatenate(
+            [_monomials(at)[:, None], _slopes(at), np.broadcast_to(second, (len(at), *second.shape))], axis=1
+        )
+        return found, np.einsum("nfa,f,nfb->nab", found, _COPIES, found).reshape(len(at), -1)
 
 
 def _monomials(x: Array) -> Array:

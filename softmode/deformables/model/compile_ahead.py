@@ -24,6 +24,7 @@ import numpy as np
 import warp as wp
 
 from softmode.quiet import quieten_warp
+from softmode.stages import KERNELS, stage
 
 quieten_warp()
 
@@ -138,8 +139,9 @@ def compiling_aside(device: wp.DeviceLike) -> Iterator[None]:
             wanted = key not in seen and not kernel.is_generic and np.min(dim) > 0
             if wanted and wp.get_device(given.get("device")) == own:
                 seen.add(key)
-                for done in compilers.begin([key], own, awaited=True):
-                    done.result()
+                with stage(KERNELS):
+                    for done in compilers.begin([key], own, awaited=True):
+                        done.result()
             return launch(kernel, *rest, **given)
 
         return compile_and_launch
@@ -250,8 +252,9 @@ class _Compilers:
 
     def wait_for_all(self) -> None:
         """Wait until everything is compiled that was begun; raise what failed."""
-        for done in self._under_way.values():
-            done.result()
+        with stage(KERNELS):
+            for done in self._under_way.values():
+                done.result()
         self._under_way.clear()
 
     def drop(self) -> None:

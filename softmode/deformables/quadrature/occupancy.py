@@ -64,7 +64,7 @@ class Occupancy:
     voxel: float
     """Distance between the nodes of its grid [m]."""
     members: NDArray[np.bool_]
-    """Which splats belong to the object: its shell, what it hides, and the haze on it; shape (N,)."""
+    """Which splats belong to the object: what lies on the solid or in it, and the haze there; shape (N,)."""
     satellites: NDArray[np.bool_]
     """Which splats belong to smaller detached parts close by (a hovering hand); not in the solid; shape (N,)."""
     report: dict[str, Any]
@@ -140,6 +140,9 @@ def fill_splats(
     size = np.ptp(mean[chosen], axis=0)
     member, satellite = np.zeros(len(mean), dtype=bool), np.zeros(len(mean), dtype=bool)
     member[chosen[solid.kept]] = True
+    # Large splats of a plain face may lie too far apart to be linked: what lies on the solid belongs to it.
+    stray = np.flatnonzero((part >= 0) & ~member)
+    member[stray[solid.holds(mean[stray])]] = True
     loose = np.flatnonzero((part < 0) & (scale[:, 0] < 0.25 * float(np.linalg.norm(size))))
     if len(loose):
         member[loose[tree.query(mean[loose])[0] < 0.5 * link]] = True

@@ -28,6 +28,8 @@ from softmode.deformables.reduction.options import FUNCTION_COUNT, BuildOptions,
 from softmode.deformables.reduction.region_samples import longest_edge, pieces_near, refine_at_faces, sample_regions
 from softmode.deformables.reduction.sources import Sources, pack_sources
 from softmode.errors import MaterialError, memory_errors
+from softmode.stages import moved
+from softmode.stages import stage as under_way
 
 __all__ = [
     "BuildOptions",
@@ -158,7 +160,7 @@ def _build(
     points, volumes, parent = refine_at_faces(regions, pieces, offset)
     stiffness = stiffness[parent]
     seconds: dict[str, float] = {}
-    with _reporter(progress, name) as report:
+    with under_way(f"building the body of {name}"), _reporter(progress, name) as report:
 
         def stage(label: str) -> None:
             seconds[label] = time.perf_counter() - start - sum(seconds.values())
@@ -366,9 +368,6 @@ def positive_field(name: str, value: Field | None, points: Array) -> Array:
 
 @contextlib.contextmanager
 def _reporter(progress: bool | Progress | None, name: str) -> Iterator[Progress]:
-    if callable(progress):
-        yield progress
-        return
     shown = progress if progress is not None else sys.stderr.isatty()
     if not shown:
         yield lambda stage, fraction: None
@@ -380,5 +379,6 @@ def _reporter(progress: bool | Progress | None, name: str) -> Iterator[Progress]
         def report(stage: str, fraction: float) -> None:
             bar.set_postfix_str(stage, refresh=False)
             bar.update(round(100.0 * fraction) - bar.n)
+            moved()
 
         yield report

@@ -548,13 +548,26 @@ def _check_asset(body: ReducedBody, told: dict[str, float], notes: _Notes) -> No
         ground, other = told.get("quadrature_ground_splats", 0.0), told.get("quadrature_other_splats", 0.0)
         what = f"{left_out:.0f} of {given:.0f} splats are floaters or separate parts and were left out"
         remedy = "look at the picture (softmode body show); crop the capture (--crop), or choose --part"
+        carrier, bare = told.get("quadrature_carrier_splats", 0.0), told.get("asset_bare_splats", 0.0)
         if ground:
             what += f"; {ground:.0f} of them are the ground beneath"
             remedy += "; --part all keeps the ground"
+        if carrier:
+            height, score = told["quadrature_carrier_height"], told["quadrature_carrier_score"]
+            what += f"; {carrier:.0f} carry it, up to z = {height:.4g} of the upright file (score {score:.2f})"
+            remedy += f"; --part {body.provenance['quadrature_carrier_part']} keeps what carries it"
+        if bare:
+            what += f"; {bare:.0f} have no solid under them"
         if other:
             what += f"; another part has {other:.0f} splats"
-            remedy += f"; --crop {body.provenance['quadrature_other_crop']} takes that one"
+            remedy += f"; --crop {body.provenance['quadrature_other_crop']} takes that one, and so does --part"
+            remedy += f" {told.get('quadrature_other_part', 2.0):.0f}"
         notes.find("warning" if left_out > 0.002 * given else "note", "left out", what, remedy)
+    if doubt := body.provenance.get("quadrature_doubt"):
+        notes.find("warning", "carrier", str(doubt), str(body.provenance["quadrature_doubt_remedy"]))
+    if crop := body.provenance.get("quadrature_scene_crop"):
+        what = "the capture is a room, or a scene of several things: one part of it was taken"
+        notes.find("warning", "scene", what, f"take one thing of it, to begin with --crop {crop}, or choose --part")
     _check_fill(told, notes)
     if told.get("quadrature_inside_out"):
         notes.find(

@@ -5,11 +5,9 @@ a body, metres of it, while splats are millimetres in size: the mean displacemen
 what is left of it in float32, and their sum is rounded once at the end.
 """
 
-from typing import Protocol
-
 import numpy as np
 import warp as wp
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from softmode.deformables.skinning import skinning_cpu_kernels as cpu_kernels
 from softmode.deformables.skinning import skinning_kernels as kernels
@@ -18,66 +16,6 @@ from softmode.errors import BasisError
 STRETCH_LIMIT = 8.0
 """Largest principal stretch that a splat follows; see `limited_stretch`. A simple shear of 3 has 3.3; where a surface
 is torn, less than 8 opens gaps in it, and more gains nothing."""
-_TOGETHER = 8192
-"""Splats that are averaged at a time: the arrays of 100,000 would be gigabytes."""
-
-
-class Functions(Protocol):
-    """Scalar functions of rest points; a `ReducedBody` is some."""
-
-    @property
-    def narrow(self) -> float:
-        """Width sqrt(3) sigma [m] of the widest splats over which they hardly bend."""
-        ...
-
-    def values(self, points: NDArray[np.float64], /) -> NDArray[np.float64]:
-        """Return values (N, n) at points [m] (N, 3)."""
-        ...
-
-    def evaluate(self, points: NDArray[np.float64], /) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return values (N, n) and gradients [1/m] (N, n, 3) at points [m] (N, 3)."""
-        ...
-
-
-def average_basis(
-    functions: Functions, means: ArrayLike, covariances: ArrayLike
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return basis values and gradients averaged over each splat, for `SkinSplats`.
-
-    A splat is as wide as the deformation varies where a basis is coarse or torn: the gradient at its centre then draws
-    it out into a spike, or leaves it behind. The Gaussian that has the mean of x(X) and the best affine fit to it is
-    the one with E[b_k] and E[grad b_k] = Sigma^-1 E[(X - mean) b_k] (Stein's lemma): statistical linearisation. Both
-    expectations are taken by the cubature rule of degree three, mean +/- sqrt(3) sigma_i e_i (Arasaratnam and Haykin
-    2009, DOI 10.1109/TAC.2009.2019800). x(X) is linear in q, so this is done once and costs nothing in a frame; affine
-    motion stays exact. It takes six evaluations; a splat over which the functions hardly bend needs one, at its centre.
-
-    Args:
-        functions: The body.
-        means: Rest centres in the body frame [m], shape (N, 3).
-        covariances: Rest covariances [m^2], shape (N, 3, 3).
-
-    Returns:
-        Values, shape (N, n), and gradients [1/m], shape (N, n, 3).
-    """
-    x = np.asarray(means, dtype=np.float64)
-    variance, axes = np.linalg.eigh(np.asarray(covariances, dtype=np.float64))
-    arms = np.sqrt(3.0 * np.maximum(variance, 0.0))
-    # Below this width the difference of two values would be rounding; a derivative is as good.
-    least = 1e-5 * max(float(np.ptp(x, axis=0).max()), float(np.sqrt(variance.max())))
-    small = arms[:, 2] <= functions.narrow
-    parts: list[tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]] = []
-    groups = [np.array_split(found, 1 + len(found) // _TOGETHER) for found in map(np.flatnonzero, (small, ~small))]
-    parts += [(rows, *functions.evaluate(x[rows])) for rows in groups[0] if len(rows)]
-    for rows in filter(len, groups[1]):
-        value, gradient = np.zeros(()), np.zeros(())
-        for i in range(3):
-            arm, axis = np.maximum(arms[rows, i], least)[:, None], axes[rows, :, i]
-            ahead, behind = (functions.values(x[rows] + way * arm * axis) for way in (1.0, -1.0))
-            value = value + (ahead + behind) / 6.0
-            gradient = gradient + ((ahead - behind) / (2.0 * arm))[:, :, None] * axis[:, None]
-        parts.append((rows, value, gradient))
-    back = np.argsort(np.concatenate([rows for rows, _, _ in parts]))
-    return np.concatenate([value for _, value, _ in parts])[back], np.concatenate([g for _, _, g in parts])[back]
 
 
 class SkinSplats:
@@ -86,7 +24,7 @@ class SkinSplats:
     Args:
         means: Rest centres in the body frame [m], shape (N, 3).
         covariances: Rest covariances [m^2], shape (N, 3, 3).
-        basis: Basis values, averaged over each splat (`average_basis`) or at its centre, shape (N, n).
+        basis: Basis values, averaged over each splat (`averages.average_basis`) or at its centre, shape (N, n).
         grad_basis: Basis gradients likewise [1/m], shape (N, n, 3).
         stretch_limit: Largest principal stretch that a splat follows.
         near: Surface samples of the body whose dents move each splat, shape (N, k), see

@@ -11,10 +11,8 @@ from typing import TYPE_CHECKING
 from softmode.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from softmode.envs.adapters.rsl_rl import RslRlVecEnv
-    from softmode.envs.adapters.skrl import SkrlWrapper
-    from softmode.envs.adapters.stable_baselines import StableBaselinesVecEnv
-
-__all__ = ["RslRlVecEnv", "SkrlWrapper", "StableBaselinesVecEnv"]
+    from softmode.envs.adapters.rsl_rl import RslRlVecEnv as RslRlVecEnv
+    from softmode.envs.adapters.skrl import SkrlWrapper as SkrlWrapper
+    from softmode.envs.adapters.stable_baselines import StableBaselinesVecEnv as StableBaselinesVecEnv
 
 __getattr__, __dir__ = lazy_names(__name__)

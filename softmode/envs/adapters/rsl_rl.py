@@ -55,7 +55,7 @@ class RslRlVecEnv(VecEnv):
         self.cfg = inner.config
         observation, _ = env.reset(seed=seed)
         self._observations = self._groups(observation)
-        self._elapsed = wp.to_torch(inner.task.elapsed)
+        self._elapsed = wp.to_torch(inner.task.episodes.elapsed)
         self.device = self._elapsed.device
         self._ended = torch.zeros(self.num_envs, dtype=torch.float32, device=self.device)
         self._last: dict[str, torch.Tensor] = {}

@@ -34,6 +34,8 @@ class Body:
     """Its other visible meshes."""
     notes: list[str] = field(default_factory=list)
     """What was read in another way than it was meant."""
+    kinematic: str = ""
+    """The note that says that the stage moves it; empty where it does not."""
 
 
 def applied(prim: Prim) -> list[str]:
@@ -231,7 +233,8 @@ def _body(root: Prim, roots: set[Value]) -> Body | None:
     body.splats = [p for p in of_type[tokens.SPLATS] if visible(p) or p == geometry]
     body.meshes = [p for p in of_type[tokens.MESH] if p != geometry and visible(p)]
     if any(one.GetName().endswith(":kinematicEnabled") and one.Get() is True for one in root.GetAuthoredAttributes()):
-        body.notes.append("is kinematic in the stage; softmode simulates it: hold it by a region, or make it rigid")
+        body.kinematic = "is kinematic in the stage; softmode simulates it: hold it by a region, or make it rigid"
+        body.notes.append(body.kinematic)
     for namespace in ("physics", "omniphysics"):
         rest = geometry.GetAttribute(f"{namespace}:restShapePoints")
         if rest and rest.HasAuthoredValue():

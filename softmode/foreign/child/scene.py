@@ -73,7 +73,7 @@ def read(stage: Stage, request: dict[str, Any], arrays: Arrays) -> dict[str, Any
         used += [str(prim.GetPath()) for prim in (geometry, *body.splats, *body.meshes)]
         beneath = [prim for prim in prims if prim.GetPath().HasPrefix(body.prim.GetPath())]
         described[-1]["notes"] += unread(beneath, used)
-    kinematic = [f"{body.prim.GetPath()}: {note}" for body in bodies for note in body.notes if "kinematic" in note]
+    kinematic = [f"{body.prim.GetPath()}: {body.kinematic}" for body in bodies if body.kinematic]
     if request["copy"] is not None:
         copy = importlib.import_module(".copy", __package__)
         copy.write_rest(stage, prims, request["copy"], used, [str(body.prim.GetPath()) for body in bodies], ignored)

@@ -36,7 +36,7 @@ def ellipsoid(radii: ArrayLike, centre: ArrayLike = (0.0, 0.0, 0.0)) -> Level:
     def level(x: Array) -> Array:
         local = x - np.asarray(centre)
         k0, k1 = np.linalg.norm(local / r, axis=1), np.linalg.norm(local / r**2, axis=1)
-        return k0 * (k0 - 1.0) / np.maximum(k1, 1e-9)
+        return np.where(k1 > 1e-9, k0 * (k0 - 1.0) / np.maximum(k1, 1e-9), -r.min())
 
     return level
 
@@ -52,14 +52,16 @@ def box(size: ArrayLike, centre: ArrayLike = (0.0, 0.0, 0.0), rounding: float = 
     return level
 
 
-def cylinder(radius: float, low: float, high: float) -> Level:
-    """Return an upright cylinder."""
+def cylinder(
+    radius: float, low: float, high: float, across: ArrayLike = (0.0, 0.0), *, axis: int = 2, rounding: float = 0.0
+) -> Level:
+    """Return a cylinder from `low` to `high` along an axis, at a place across it, grown by a rounding."""
+    others = [d for d in range(3) if d != axis]
 
     def level(x: Array) -> Array:
-        away = np.stack(
-            [np.hypot(x[:, 0], x[:, 1]) - radius, np.abs(x[:, 2] - 0.5 * (low + high)) - 0.5 * (high - low)]
-        )
-        return np.linalg.norm(np.maximum(away, 0.0), axis=0) + np.minimum(away.max(axis=0), 0.0)
+        u, v = (x[:, others] - np.asarray(across)).T
+        away = np.stack([np.hypot(u, v) - radius, np.abs(x[:, axis] - 0.5 * (low + high)) - 0.5 * (high - low)])
+        return np.linalg.norm(np.maximum(away, 0.0), axis=0) + np.minimum(away.max(axis=0), 0.0) - rounding
 
     return level
 

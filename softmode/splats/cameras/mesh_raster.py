@@ -19,6 +19,7 @@ from softmode.deformables.model.declare import launch
 from softmode.splats.cameras import mesh_raster_kernels as kernels
 from softmode.splats.cameras.camera_options import CameraOptions
 from softmode.splats.cameras.light import encoded_light, light_frame, linear_light
+from softmode.splats.raster.pinhole import Vector
 from softmode.splats.raster.rasterizer import SplatArrays, SplatRasterizer, ViewArrays
 from softmode.splats.raster.scan_kernels import NOTHING
 
@@ -30,6 +31,24 @@ FAR = 1.0e30
 """Depth of nothing along the light [m]."""
 BANDS = 32
 """Threads of a triangle on CUDA."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilmLook:
+    """A second light, wood, and a room around all, for pictures that people look at."""
+
+    fill_direction: Vector = (0.55, -0.75, -0.45)
+    """Direction in which the second light travels; it casts no shadow."""
+    fill_color: Vector = (0.20, 0.22, 0.26)
+    """Its linear radiance."""
+    table: Vector = (0.70, 0.64, 0.57)
+    """Colour of the table's planks, sRGB."""
+    room: tuple[Vector, Vector] = ((-1.1, -1.6, -0.75), (3.0, 1.9, 1.9))
+    """Lowest and highest corner of the room [m]."""
+    wall: Vector = (0.70, 0.76, 0.80)
+    """Colour of its walls, sRGB."""
+    floor: Vector = (0.55, 0.46, 0.38)
+    """Colour of its floor, sRGB."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -50,6 +69,8 @@ class TriangleMeshes:
     """Whether each triangle is of a closed mesh, shape (F,)."""
     bodies: NDArray[np.int32]
     """Body of each corner, counted from the first of its world; -1 for none, shape (V,)."""
+    wooden: NDArray[np.bool_]
+    """Whether each triangle is made of planks, shape (F,)."""
 
 
 class MeshRaster:
@@ -67,6 +88,7 @@ class MeshRaster:
         width: Image width [px].
         height: Image height [px].
         light: Light and sky.
+        look: A second light and a room; None for none.
         device: Warp device.
     """
 
@@ -81,6 +103,7 @@ class MeshRaster:
         height: int,
         *,
         light: CameraOptions,
+        look: FilmLook | None = None,
         device: wp.Device,
     ) -> None:
         """Upload the triangles and allocate the images."""
@@ -99,9 +122,10 @@ class MeshRaster:
         t.color = wp.array(np.hstack([linear_light(meshes.colors[order]), first]), dtype=wp.vec4, device=device)
         t.patch = wp.array(patches[order], dtype=wp.int32, device=device)
         t.closed = wp.array(meshes.closed[order], dtype=wp.bool, device=device)
+        t.wooden = wp.array(meshes.wooden[order], dtype=wp.bool, device=device)
         t.body_start = wp.array(body_start, dtype=wp.int32, device=device)
         self._triangles = t
-        self._light = _light(light, center, radius, device)
+        self._light = _light(light, look, center, radius, device)
         self._shadows = light.shadows
         moved = (self._worlds, len(meshes.corners))
         self._corner, self._normal = (wp.zeros(moved, dtype=wp.vec3, device=device) for _ in range(2))
@@ -130,8 +154,7 @@ class MeshRaster:
             plate: What is drawn of a scene of splats that the meshes stand in, with its `median_depth`.
         """
         device, triangles, light = self.device, self._triangles, self._light
-        seen = kernels.Views()
-        seen.world_to_camera, seen.intrinsics, seen.world = views.world_to_camera, views.intrinsics, views.world
+        seen = _views(views)
         count, height, width = self.rgb.shape
         corner, faces = self._corner, triangles.face.shape[0]
         launch(device, kernels.move_corners, corner.shape, triangles, body_q, corner, self._normal)
@@ -148,6 +171,19 @@ class MeshRaster:
             triangles, corner, self._normal, seen, light, self._shadow, self._key, *images, span,
             self.rgb, self.depth, self._near, self._near_depth,
         )  # fmt: skip
+
+    def circle(self, center: wp.array, radius: wp.array, color: Vector, views: ViewArrays) -> None:
+        """Draw a thin ring around a place of each world into the frame that was drawn, before splats are.
+
+        Args:
+            center: The places [m], vec3, shape (world_count,).
+            radius: Radii of the rings [m], shape (world_count,).
+            color: Their colour, sRGB.
+            views: The cameras.
+        """
+        width = max(1.5, 0.007 * self.rgb.shape[1])
+        given = (center, radius, wp.vec3(*color), width, _views(views), self.depth)
+        launch(self.device, kernels.draw_rings, self.rgb.shape[:2], *given, self.rgb)
 
     def _cast(self, casters: SplatArrays | None) -> None:
         """Draw the map of shadows; what stands still is drawn once."""
@@ -180,7 +216,16 @@ class MeshRaster:
         launch(self.device, kernels.join_layers, rows, *drawn, *layers, span, bytes_out)
 
 
-def _light(options: CameraOptions, center: NDArray[np.float64], radius: float, device: wp.Device) -> Any:
+def _views(views: ViewArrays) -> Any:
+    """Return the cameras as the kernels take them."""
+    seen = kernels.Views()
+    seen.world_to_camera, seen.intrinsics, seen.world = views.world_to_camera, views.intrinsics, views.world
+    return seen
+
+
+def _light(
+    options: CameraOptions, look: FilmLook | None, center: NDArray[np.float64], radius: float, device: wp.Device
+) -> Any:
     """Return what the kernels know of the light, the map of shadows about a centre [m]."""
     frame = light_frame(options.light_direction)
     light = kernels.Light()
@@ -189,6 +234,10 @@ def _light(options: CameraOptions, center: NDArray[np.float64], radius: float, d
     light.cell = 2.0 * radius / CELLS
     light.above, light.below = (wp.vec3(*radiance) for radiance in options.ambient)
     light.sun = wp.vec3(*options.light_color)
+    if look is not None:
+        light.fill_direction = wp.vec3(*light_frame(look.fill_direction)[2])
+        light.fill, light.wall, light.floor = (wp.vec3(*c) for c in (look.fill_color, look.wall, look.floor))
+        light.room_low, light.room_high = (wp.vec3(*corner) for corner in look.room)
     light.horizon, light.zenith = (wp.vec3(*color) for color in options.sky)
     light.encoded = encoded_light(device)
     return light

@@ -33,6 +33,11 @@ WIDEST = wp.constant(8.0)
 SPOTS = ((-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375))
 """Where the samples are from the middle of their pixel; no two share a row or a column."""
 
+PLANK = wp.constant(wp.vec2(0.09, 0.60))
+"""Width and length of a plank of a table or floor [m]."""
+GRAIN = wp.constant(0.004)
+"""Width of the grain of wood [m]."""
+
 layer = wp.types.vector(length=4, dtype=float)
 
 
@@ -48,6 +53,7 @@ class Triangles:
     patch: wp.array[int]  # (F,) smooth patch that it is of
     closed: wp.array[wp.bool]  # (F,) whether the face is of a closed mesh, whose inside nobody sees
     body_start: wp.array[int]  # (world_count,)
+    wooden: wp.array[wp.bool]  # (F,) whether the face is made of planks
 
 
 @wp.struct
@@ -60,6 +66,12 @@ class Light:
     above: wp.vec3  # linear ambient radiance
     below: wp.vec3
     sun: wp.vec3
+    fill_direction: wp.vec3  # in which the second light travels, which casts no shadow
+    fill: wp.vec3
+    room_low: wp.vec3  # lowest corner of the room around all [m]
+    room_high: wp.vec3  # highest; not above the lowest one for a sky
+    wall: wp.vec3  # sRGB
+    floor: wp.vec3  # sRGB
     horizon: wp.vec3  # sRGB
     zenith: wp.vec3
     encoded: wp.array[float]  # (ENCODED + 1,) sRGB of linear light 0..1
@@ -257,6 +269,67 @@ def shaded(light: Light, depth: wp.array3d[float], world: int, p: wp.vec3) -> fl
 
 
 @wp.func
+def planks(x: float, y: float, footprint: float) -> float:
+    """Return how bright wood is at a point [m], about 1; what is finer than a pixel's footprint [m] is left out."""
+    row = wp.floor(x / PLANK[0])
+    shift = wp.randf(wp.rand_init(7, int(row) + 4096))
+    column = wp.floor(y / PLANK[1] + shift)
+    own = wp.randf(wp.rand_init(int(row) + 4096, int(column) + 4096))
+    across = wp.abs(x / PLANK[0] - row - 0.5) * PLANK[0]
+    along = wp.abs(y / PLANK[1] + shift - column - 0.5) * PLANK[1]
+    seam = wp.max(across - 0.5 * PLANK[0], along - 0.5 * PLANK[1])
+    width = wp.max(0.0008, 0.5 * footprint)
+    dark = wp.clamp(1.0 + (seam + width) / width, 0.0, 1.0) * 0.0008 / width
+    bend = 0.8 * wp.sin(9.0 * y + 40.0 * own) + 0.5 * wp.sin(23.0 * y + 60.0 * own)
+    grain = float(0.0)
+    if footprint < 0.75 * GRAIN:
+        place = wp.vec2(x / GRAIN + bend + 50.0 * own, y / (14.0 * GRAIN) + 90.0 * own)
+        grain = 0.14 * wp.clamp(1.5 - 2.0 * footprint / GRAIN, 0.0, 1.0) * wp.noise(wp.uint32(5), place)
+    grain += 0.03 * wp.sin(0.35 * (x / GRAIN + bend) + 50.0 * own)
+    return (0.92 + 0.16 * own + grain) * (1.0 - 0.55 * dark)
+
+
+@wp.func
+def room_color(light: Light, eye: wp.vec3, ray: wp.vec3, pixel: float) -> wp.vec3:
+    """Return the colour of floor, wall or ceiling along a ray from within the room; corners are darker."""
+    first = float(1.0e30)
+    side = int(0)
+    for axis in range(3):
+        if ray[axis] != 0.0:
+            edge = wp.where(ray[axis] > 0.0, light.room_high[axis], light.room_low[axis])
+            t = (edge - eye[axis]) / ray[axis]
+            if t > 0.0 and t < first:
+                first = t
+                side = axis
+    p = eye + first * ray
+    footprint = pixel * first
+    nearest = float(1.0e30)  # other wall
+    for axis in range(3):
+        if axis != side:
+            nearest = wp.min(nearest, wp.min(p[axis] - light.room_low[axis], light.room_high[axis] - p[axis]))
+    corner = 1.0 - 0.28 * wp.exp(-nearest / 0.35)
+    if side == 2 and ray[2] < 0.0:
+        from_middle = wp.length(wp.vec2(p[0] - 0.35, p[1]))
+        flat = footprint * wp.length(ray) / -ray[2]
+        return light.floor * (corner * planks(p[1], p[0], flat) * (0.72 + 0.28 * wp.clamp(from_middle, 0.0, 1.0)))
+    height = p[2] - light.room_low[2]
+    board = wp.clamp((0.10 - height) / (footprint + 0.002) + 0.5, 0.0, 1.0)
+    tone = 0.84 + 0.16 * wp.clamp(height / 2.2, 0.0, 1.0)
+    if side == 0:
+        tone *= 0.94
+    wall = light.wall * (corner * tone)
+    return board * 0.93 * corner * wp.vec3(1.0, 1.0, 1.0) + (1.0 - board) * wall
+
+
+@wp.func
+def behind_all(light: Light, eye: wp.vec3, ray: wp.vec3, pixel: float) -> wp.vec3:
+    """Return the colour of room or sky along a ray."""
+    if light.room_high[0] > light.room_low[0]:
+        return room_color(light, eye, ray, pixel)
+    return sky_color(light.horizon, light.zenith, ray)
+
+
+@wp.func
 def shade(
     triangles: Triangles,
     corner: wp.array2d[wp.vec3],
@@ -267,6 +340,7 @@ def shade(
     f: int,
     eye: wp.vec3,
     ray: wp.vec3,
+    pixel: float,
 ) -> wp.vec3:
     """Return the colour of a triangle where a ray meets it, or at the nearest of its points."""
     index = triangles.face[f]
@@ -293,7 +367,12 @@ def shade(
         p = p0 + s * a + t * b + OFF * light.cell * n
         left = 1.0 - (1.0 - SHADOW_LIGHT) * shaded(light, shadow, world, p)
         received += toward * left * light.sun
+    received += wp.max(-wp.dot(n, light.fill_direction), 0.0) * light.fill
     color = triangles.color[f]
+    if triangles.wooden[f]:
+        p = p0 + s * a + t * b
+        sight = p - eye
+        received *= planks(p[0], p[1], pixel * wp.dot(sight, sight) / wp.max(wp.abs(wp.dot(sight, n)), 1.0e-6))
     return encode(light.encoded, wp.cw_mul(wp.vec3(color[0], color[1], color[2]), received))
 
 
@@ -340,6 +419,7 @@ def shade_pixels(
     ))  # fmt: skip
     eye = -(turn * wp.vec3(matrix[0, 3], matrix[1, 3], matrix[2, 3]))
     width = rgb_out.shape[2]
+    pixel = 1.0 / lens[0]
     has_plate = plate_rgb.shape[0] > 0
     for column in range(part * span, wp.min((part + 1) * span, width)):
         x = (float(column) + 0.5 - lens[2]) / lens[0]
@@ -356,9 +436,9 @@ def shade_pixels(
             color = wp.vec3()
             z = float(0.0)
             if patch < 0:
-                color = sky_color(light.horizon, light.zenith, ray)
+                color = behind_all(light, eye, ray, pixel)
             else:
-                color = shade(triangles, corner, normal, light, shadow, world, int(wp.uint32(k)), eye, ray)
+                color = shade(triangles, corner, normal, light, shadow, world, int(wp.uint32(k)), eye, ray, pixel)
                 z = 1.0 / inverse_depth(k)
             rgb_out[view, row, column] = color
             depth_out[view, row, column] = z
@@ -394,9 +474,9 @@ def shade_pixels(
                 if same > 0.0:
                     if patches[sample] >= 0:
                         face = int(wp.uint32(key[view, place + sample]))
-                        color = shade(triangles, corner, normal, light, shadow, world, face, eye, ray)
+                        color = shade(triangles, corner, normal, light, shadow, world, face, eye, ray, pixel)
                     else:
-                        color = sky_color(light.horizon, light.zenith, ray)
+                        color = behind_all(light, eye, ray, pixel)
                         if has_plate:
                             color = plate_rgb[view, row, column] + (1.0 - plate_alpha[view, row, column]) * color
                     weighted = same * layer(color[0], color[1], color[2], 1.0)
@@ -416,6 +496,42 @@ def shade_pixels(
             near_depth_out[view, row, column] = nearest
         for sample in range(wp.static(SAMPLES)):
             key[view, place + sample] = wp.uint64(wp.static(NOTHING))
+
+
+@wp.kernel
+def draw_rings(
+    center: wp.array[wp.vec3],  # (world_count,) [m]
+    radius: wp.array[float],  # (world_count,) [m]
+    color: wp.vec3,  # sRGB
+    width: float,  # of the line [px]
+    views: Views,
+    depth: wp.array3d[float],  # of the far layer [m]
+    # Out:
+    rgb_out: wp.array3d[wp.vec3],
+):
+    """Draw a thin ring that faces the camera around a place of each world; it is faint behind meshes."""
+    view, row = wp.tid()
+    world = views.world[view]
+    lens = views.intrinsics[view]
+    q = wp.transform_point(views.world_to_camera[view], center[world])
+    if q[2] <= NEAR:
+        return
+    x = lens[0] * q[0] / q[2] + lens[2] - 0.5
+    y = lens[1] * q[1] / q[2] + lens[3] - 0.5 - float(row)
+    r = lens[0] * radius[world] / q[2]
+    reach = (r + width) * (r + width) - y * y
+    if reach <= 0.0:
+        return
+    half = wp.sqrt(reach)
+    for column in range(
+        int(wp.max(0.0, wp.ceil(x - half))), int(wp.min(float(rgb_out.shape[2] - 1), wp.floor(x + half))) + 1
+    ):
+        off = wp.abs(wp.length(wp.vec2(float(column) - x, y)) - r)
+        strength = wp.clamp(0.5 * width + 0.5 - off, 0.0, 1.0)
+        z = depth[view, row, column]
+        if z > 0.0 and z < q[2]:
+            strength *= 0.3
+        rgb_out[view, row, column] = wp.lerp(rgb_out[view, row, column], color, strength)
 
 
 @wp.kernel

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from softmode.envs.end_reason import EndReason
-from softmode.envs.reward_kernels import TOUCH_FORCE
+from softmode.envs.reward_kernels import TOUCH_FORCE, EndReason
 from softmode.envs.tasks.lift_soft.task import LiftSoftConfig
 
 LIFTED = 0.01

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.envs.scripted_base import Environment, ScriptedPolicy, Vector, bounded
+from softmode.envs.scripted import Environment, ScriptedPolicy, Vector, bounded
 from softmode.envs.scripted_grasp import ScriptedGrasp
 from softmode.envs.tasks.lift_soft.task import LiftSoft
 

@@ -80,8 +80,9 @@ class LiftSoft(Task):
 
     config: LiftSoftConfig
     config_class = LiftSoftConfig
-    kernels = kernels
+    step_kernels = (kernels.observe, kernels.evaluate)
     grasps = True
+    filmed_across = goal_ring = True
     takes_sets = True
     takes_several = True
     any_robot = True
@@ -90,7 +91,7 @@ class LiftSoft(Task):
 
     def build(self) -> None:
         """Measure the objects."""
-        self.radius = self.per_object([thing.radius for thing in self.scene.members])
+        self.radius = self.scene.occupancy.follow([thing.radius for thing in self.scene.occupancy.choices])
         """From the centre of each unscaled object to its farthest point [m], shape (world_count,)."""
 
     def parameters(self) -> tuple[Parameter, ...]:
@@ -111,15 +112,9 @@ class LiftSoft(Task):
         return sphere_marker(0.4 * self.config.goal_tolerance)
 
 
-class LiftSoftEnv(SoftEnv):
+class LiftSoftEnv(SoftEnv[LiftSoft]):
     """One arm, one soft object, one goal; see :class:`LiftSoft` and :class:`SoftEnv`."""
 
-    config: LiftSoftConfig
-    task: LiftSoft
-    task_class = LiftSoft
 
-
-class LiftSoftVectorEnv(SoftVectorEnv):
+class LiftSoftVectorEnv(SoftVectorEnv[LiftSoft]):
     """Many worlds of it; see :class:`LiftSoft` and :class:`SoftVectorEnv`."""
-
-    task_class = LiftSoft

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from softmode.envs.position_goals import PositionGoalMethods, PositionGoals
+from softmode.envs.goals import PositionGoalMethods, PositionGoals
 from softmode.envs.soft_env import SoftEnv
 from softmode.envs.soft_vector_env import SoftVectorEnv
 from softmode.envs.tasks.lift_soft.task import LiftSoft, LiftSoftConfig
@@ -29,18 +29,9 @@ class LiftSoftGoal(PositionGoals, LiftSoft):
     goal_size = 3
 
 
-class LiftSoftGoalEnv(PositionGoalMethods, SoftEnv):
+class LiftSoftGoalEnv(PositionGoalMethods, SoftEnv[LiftSoftGoal]):
     """The environment of one world; see :class:`LiftSoftGoal` and :class:`SoftEnv`."""
 
-    config: LiftSoftGoalConfig
-    task: LiftSoftGoal
-    task_class = LiftSoftGoal
-    goal_size = 3
 
-
-class LiftSoftGoalVectorEnv(PositionGoalMethods, SoftVectorEnv):
+class LiftSoftGoalVectorEnv(PositionGoalMethods, SoftVectorEnv[LiftSoftGoal]):
     """Many worlds of it; see :class:`LiftSoftGoal` and :class:`SoftVectorEnv`."""
-
-    config: LiftSoftGoalConfig
-    task_class = LiftSoftGoal
-    goal_size = 3

@@ -4,9 +4,9 @@ from enum import IntEnum
 
 import warp as wp
 
-from softmode.envs.end_reason import EndReason
 from softmode.envs.reward_kernels import (
     NEAR,
+    EndReason,
     StepResult,
     WorldState,
     count_held,
@@ -30,28 +30,14 @@ GENTLE = wp.constant(5.0)
 
 
 @wp.struct
-class Drawn:
-    """Columns of the parameters."""
-
-    scale: int
-
-
-@wp.struct
-class Columns:
-    """Columns of the observation."""
-
-    goal: int
-    goal_offset: int
-    object_goal: int
-
-
-@wp.struct
 class Plan:
     """Columns, the bin and the toys that are to lie in it, and when the goal is met."""
 
-    drawn: Drawn
-    columns: Columns
-    other_offsets: int  # column of the observation; zero where there are no others
+    drawn_scale: int
+    column_goal: int
+    column_goal_offset: int
+    column_object_goal: int
+    column_other_offsets: int  # column of the observation; zero where there are no others
     rim: wp.vec3  # centre of the bin's opening [m]
     half: wp.vec2  # half of its inner edges [m]
     margin: float  # of the part of the bin over which to lower the object, from its walls [m]
@@ -81,6 +67,12 @@ def inside_bin(plan: Plan, x: wp.vec3):
 
 
 @wp.func
+def over_bin(plan: Plan, x: wp.vec3):
+    """Return whether nothing is lost by letting an object go: it is in the bin, or what falls, falls into it."""
+    return inside_bin(plan, x) or beyond(x, plan.rim, plan.half - wp.vec2(plan.margin, plan.margin)) == 0.0
+
+
+@wp.func
 def toy_at_hand(state: WorldState, plan: Plan, w: int):
     """Return the toy whose turn it is: the first that is not in the bin, else the first."""
     for o in range(state.slots):
@@ -95,9 +87,9 @@ def observe(state: WorldState, plan: Plan, result: StepResult):
     w = wp.tid()
     rim = plan.rim
     x = state.object_position[w, 0]
-    write(result.observation, w, plan.columns.goal, rim)
-    write(result.observation, w, plan.columns.goal_offset, rim - tool_position(state, w))
-    write(result.observation, w, plan.columns.object_goal, rim - x)
+    write(result.observation, w, plan.column_goal, rim)
+    write(result.observation, w, plan.column_goal_offset, rim - tool_position(state, w))
+    write(result.observation, w, plan.column_object_goal, rim - x)
     toy = toy_at_hand(state, plan, w)
     inside = float(0.0)
     for o in range(state.stride):
@@ -105,7 +97,7 @@ def observe(state: WorldState, plan: Plan, result: StepResult):
         if o != toy and is_there(state, w, o) and inside_bin(plan, other):
             inside += 1.0
         if o >= state.slots:
-            write(result.observation, w, plan.other_offsets + 3 * (o - state.slots), other - x)
+            write(result.observation, w, plan.column_other_offsets + 3 * (o - state.slots), other - x)
     now = state.object_position[w, toy]
     result.metrics[w, Metric.object_height] = now[2]
     result.metrics[w, Metric.bin_distance] = beyond(now, rim, plan.half)
@@ -133,14 +125,13 @@ def way_to_go(plan: Plan, x: wp.vec3, low: float):
 def add_toy(state: WorldState, plan: Plan, w: int, o: int, at_hand: bool, share: float, result: StepResult):
     """Add a toy's share of the reward for reaching, grasping, carrying and letting go; each rises along the task."""
     x = state.object_position[w, o]
-    size = state.parameters[w, plan.drawn.scale]
+    size = state.parameters[w, plan.drawn_scale]
     distance = wp.length(x - tool_position(state, w))
     reach = 1.0 - wp.tanh(5.0 * distance)
     grasp = float(0.0)
     free = float(0.0)
     inside = inside_bin(plan, x)
-    # over the bin nothing is lost by letting go: what falls, falls into it
-    over = inside or beyond(x, plan.rim, plan.half - wp.vec2(plan.margin, plan.margin)) == 0.0
+    over = over_bin(plan, x)
     # fingers may feel another object: only near this one they hold it
     if over or (grasped(state, w) and distance < size * plan.radius[w, o] + NEAR):
         grasp = 1.0
@@ -165,10 +156,13 @@ def evaluate(state: WorldState, plan: Plan, result: StepResult):
     w = wp.tid()
     toy = toy_at_hand(state, plan, w)
     count = int(0)
+    at_goal = int(0)
     resting = not touched(state, w)
     for o in range(state.stride):
         if is_there(state, w, o):
             resting = resting and inside_bin(plan, state.object_position[w, o])
+            if over_bin(plan, state.object_position[w, o]):
+                at_goal = at_goal | (1 << o)
             if o < state.slots:
                 count += 1
                 resting = resting and wp.length(state.object_velocity[w, o]) <= plan.rest_speed
@@ -179,6 +173,7 @@ def evaluate(state: WorldState, plan: Plan, result: StepResult):
         if is_there(state, w, o) and (o == toy or inside_bin(plan, state.object_position[w, o])):
             add_toy(state, plan, w, o, o == toy, 1.0 / float(count), result)
     result.terms[w, Term.rest] = wp.where(resting, 2.0, 0.0)
+    result.at_goal[w] = at_goal
     count_held(resting, plan.hold_steps, result, w)
     walls = plan.half + wp.vec2(plan.wall, plan.wall)
     for o in range(1, state.stride):

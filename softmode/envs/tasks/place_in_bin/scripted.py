@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.envs.scripted_base import Environment, ScriptedPolicy, Vector, bounded
+from softmode.envs.scripted import Environment, ScriptedPolicy, Vector, bounded
 from softmode.envs.scripted_grasp import ScriptedGrasp
 from softmode.envs.tasks.place_in_bin.kernels import Metric
 from softmode.envs.tasks.place_in_bin.task import PlaceInBin
@@ -86,8 +86,8 @@ class ScriptedPlace(ScriptedPolicy):
     def _next(self) -> int:
         """Return the first toy that is not in the bin, the first of all if they are."""
         first = self.world * self.task.state.stride
-        slots = [i - first for i in self.scene.instances_of(self.world)]
-        return next((s for s in slots if s < self.task.slots and not self._is_inside(s)), 0)
+        slots = [i - first for i in self.scene.occupancy.instances_of(self.world)]
+        return next((s for s in slots if s < self.scene.occupancy.slots and not self._is_inside(s)), 0)
 
     def _let_go(self) -> NDArray[np.float32]:
         """Open far enough, then rise; start again if the toy ended up beside the bin."""

@@ -14,13 +14,14 @@ from softmode.checks import require_fields, require_number, require_numbers
 from softmode.deformables.materials.material import Material
 from softmode.deformables.reduction.options import BuildOptions
 from softmode.envs.cameras import square_camera
-from softmode.envs.clutter import Arcs
+from softmode.envs.episodes import FALL
 from softmode.envs.observation import Segment
 from softmode.envs.parameters import Parameter
+from softmode.envs.placement import Arcs
 from softmode.envs.presets import RL_SOLVER
 from softmode.envs.soft_env import SoftEnv
 from softmode.envs.soft_vector_env import SoftVectorEnv
-from softmode.envs.task import FALL, Task
+from softmode.envs.task import Task
 from softmode.envs.task_config import TaskConfig
 from softmode.envs.tasks.place_in_bin import kernels
 from softmode.errors import ConfigError
@@ -173,7 +174,7 @@ class PlaceInBin(Task):
 
     config: PlaceInBinConfig
     config_class = PlaceInBinConfig
-    kernels = kernels
+    step_kernels = (kernels.observe, kernels.evaluate)
     grasps = True
     any_robot = True
     takes_sets = True
@@ -195,14 +196,15 @@ class PlaceInBin(Task):
         """Half of its inner edges [m]."""
         self.highest = given.height + self.config.rim_allowance
         """Height of its centre below which an object is in the bin [m]."""
-        toys = [thing.body.surface_points for thing in self.scene.members]
-        others = [thing.body.surface_points for thing in self.scene.objects[self.slots :]]
+        held = self.scene.occupancy
+        toys = [thing.body.surface_points for thing in held.choices]
+        others = [thing.body.surface_points for thing in held.others]
         self.wall, self.floor, self.margin, self.clearance = given.wall, given.floor, 0.3 * min(self.half), CLEARANCE
-        radius = [[thing.radius] * self.slots for thing in self.scene.members]
-        self.radius = self.per_object(radius, every_slot=self.slots > 1)
+        radius = [[thing.radius] * held.slots for thing in held.choices]
+        self.radius = held.follow(radius, every_slot=held.slots > 1)
         """From the centre of each unscaled toy to its farthest point [m], shape (world_count, slots)."""
-        self.heights, self.dropped = self._heights, -FALL
-        self.other_offsets = self.column("other_offsets") if self.config.scene.others else 0
+        self.heights, self.dropped = self.placement.heights, -FALL
+        self.column_other_offsets = 0  # where there are no others
         scale = (self.config.scale_range or (1.0, 1.0))[1]
         radii = [[scale * float(np.linalg.norm(x[:, :2], axis=1).max()) for x in each] for each in (toys, others)]
         self._check_room(max(radii[0]), radii[1])
@@ -216,7 +218,7 @@ class PlaceInBin(Task):
             ConfigError: If there is one; it names the toy.
         """
         inner = np.sort(self.config.bin.inner)
-        for name, width in zip(self.member_names, widths, strict=True):
+        for name, width in zip(self.scene.occupancy.names, widths, strict=True):
             if (np.sort(width) > inner).any():
                 raise ConfigError(
                     f"{name} is {width[0]:.3f} m by {width[1]:.3f} m wide and does not fit the bin",
@@ -230,9 +232,10 @@ class PlaceInBin(Task):
             volume: That of the largest toy's bounding box [m^3].
         """
         room = 4.0 * self.half[0] * self.half[1] * (self.highest - self.floor)
-        if self.slots > 1 and self.slots * volume > PACKED * room:
+        slots = self.scene.occupancy.slots
+        if slots > 1 and slots * volume > PACKED * room:
             raise ConfigError(
-                f"{self.slots} toys of {1.0e6 * volume:.0f} cm^3 do not fit a bin of {1.0e6 * room:.0f} cm^3",
+                f"{slots} toys of {1.0e6 * volume:.0f} cm^3 do not fit a bin of {1.0e6 * room:.0f} cm^3",
                 hint="make objects.per_world or the toys smaller, or bin.inner larger",
             )
 
@@ -310,22 +313,17 @@ class PlaceInBin(Task):
         super().place()
         for k in range(len(self.config.scene.others)):
             name = k + 1
-            self.place_object(self.slots + k, f"other_position_{name}", f"other_yaw_{name}", ground=self.floor)
+            index = self.scene.occupancy.slots + k
+            self.placement.put(index, f"other_position_{name}", f"other_yaw_{name}", ground=self.floor)
 
     def front_camera(self, name: str, edge: int) -> PinholeCamera:
         """Return the camera that looks over the rim into the bin, with pictures of `edge` x `edge` pixels."""
         return square_camera(name, edge, (0.98, 0.02, 0.52), (0.42, 0.022, 0.04), 0.70)
 
 
-class PlaceInBinEnv(SoftEnv):
+class PlaceInBinEnv(SoftEnv[PlaceInBin]):
     """One arm, a toy, a bin with other soft objects; see :class:`PlaceInBin` and :class:`SoftEnv`."""
 
-    config: PlaceInBinConfig
-    task: PlaceInBin
-    task_class = PlaceInBin
 
-
-class PlaceInBinVectorEnv(SoftVectorEnv):
+class PlaceInBinVectorEnv(SoftVectorEnv[PlaceInBin]):
     """Many worlds of it; see :class:`PlaceInBin` and :class:`SoftVectorEnv`."""
-
-    task_class = PlaceInBin

@@ -15,28 +15,14 @@ GAUGE = wp.constant(0.01)
 
 
 @wp.struct
-class Drawn:
-    """Columns of the parameters."""
-
-    goal_force: int  # [N]
-    scale: int
-
-
-@wp.struct
-class Columns:
-    """Columns of the observation."""
-
-    goal_force: int
-    contact_force: int
-    missing_force: int
-
-
-@wp.struct
 class Plan:
     """Columns, what is pressed, with what, and when the goal is met."""
 
-    drawn: Drawn
-    columns: Columns
+    drawn_goal_force: int  # [N]
+    drawn_scale: int
+    column_goal_force: int
+    column_contact_force: int
+    column_missing_force: int
     top: wp.array[float]  # height of every unscaled pad [m]
     tip_length: float  # from the tool point down to the finger tips [m]
     force_tolerance: float  # as a share of the goal
@@ -49,15 +35,15 @@ class Plan:
 def observe(state: WorldState, plan: Plan, result: StepResult):
     """Write goal force, contact force and their difference; the metrics; and the marker over the plan."""
     w = wp.tid()
-    goal = state.parameters[w, plan.drawn.goal_force]
-    surface = plan.top[w] * state.parameters[w, plan.drawn.scale]
+    goal = state.parameters[w, plan.drawn_goal_force]
+    surface = plan.top[w] * state.parameters[w, plan.drawn_scale]
     p = tool_position(state, w)
     x = state.object_position[w, 0]
     # vertical: what the fingers squeeze each other with adds nothing
     force = state.finger_force[w, 0][2] + state.finger_force[w, 1][2]
-    result.observation[w, plan.columns.goal_force] = goal
-    result.observation[w, plan.columns.contact_force] = force
-    result.observation[w, plan.columns.missing_force] = goal - force
+    result.observation[w, plan.column_goal_force] = goal
+    result.observation[w, plan.column_contact_force] = force
+    result.observation[w, plan.column_missing_force] = goal - force
     aside = wp.sqrt((x[0] - p[0]) * (x[0] - p[0]) + (x[1] - p[1]) * (x[1] - p[1]))
     result.metrics[w, Metric.contact_force] = force
     result.metrics[w, Metric.force_error] = force - goal
@@ -72,7 +58,7 @@ def observe(state: WorldState, plan: Plan, result: StepResult):
 def evaluate(state: WorldState, plan: Plan, result: StepResult):
     """Reward reaching the middle of the pad, the right force, and keeping it; punish far too much."""
     w = wp.tid()
-    goal = state.parameters[w, plan.drawn.goal_force]
+    goal = state.parameters[w, plan.drawn_goal_force]
     force = result.metrics[w, Metric.contact_force]
     error = wp.abs(result.metrics[w, Metric.force_error])
     distance = result.metrics[w, Metric.centre_distance]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.envs.scripted_base import Environment, ScriptedPolicy
+from softmode.envs.scripted import Environment, ScriptedPolicy
 from softmode.envs.tasks.press_soft.kernels import Metric
 from softmode.envs.tasks.press_soft.task import PressSoft
 

@@ -124,7 +124,7 @@ class PressSoft(Task):
 
     config: PressSoftConfig
     config_class = PressSoftConfig
-    kernels = kernels
+    step_kernels = (kernels.observe, kernels.evaluate)
     takes_sets = True
     any_robot = True
     term_names = tuple(kernels.Term.__members__)
@@ -132,18 +132,18 @@ class PressSoft(Task):
 
     def build(self) -> None:
         """Upload how high the pads are."""
-        self.top = self.per_object(self._tops)
+        self.top = self.scene.occupancy.follow(self._tops)
         """Height of every unscaled pad [m], shape (world_count,), on the device."""
 
     @property
     def _tops(self) -> NDArray[np.float64]:
-        """Height of every unscaled pad that a world may have [m], shape (members,)."""
-        return np.array([float(np.ptp(thing.body.surface_points[:, 2])) for thing in self.scene.members])
+        """Height of every unscaled pad that a world may have [m], shape (choices,)."""
+        return np.array([float(np.ptp(thing.body.surface_points[:, 2])) for thing in self.scene.occupancy.choices])
 
     @property
     def tops(self) -> NDArray[np.float64]:
         """Height of every unscaled pad [m], shape (world_count,)."""
-        return self._tops[self.scene.member]
+        return self._tops[self.scene.occupancy.rows]
 
     @property
     def tip_length(self) -> float:
@@ -196,15 +196,9 @@ class PressSoft(Task):
         return square_camera(name, edge, (0.80, -0.24, 0.21), (0.465, 0.015, 0.065), 0.42)
 
 
-class PressSoftEnv(SoftEnv):
+class PressSoftEnv(SoftEnv[PressSoft]):
     """One arm, one pad, one force; see :class:`PressSoft` and :class:`SoftEnv`."""
 
-    config: PressSoftConfig
-    task: PressSoft
-    task_class = PressSoft
 
-
-class PressSoftVectorEnv(SoftVectorEnv):
+class PressSoftVectorEnv(SoftVectorEnv[PressSoft]):
     """Many worlds of it; see :class:`PressSoft` and :class:`SoftVectorEnv`."""
-
-    task_class = PressSoft

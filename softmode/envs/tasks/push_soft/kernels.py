@@ -13,34 +13,20 @@ Metric = IntEnum("Metric", "goal_distance yaw_error", start=0)
 
 
 @wp.struct
-class Drawn:
-    """Columns of the parameters."""
-
-    position: int
-    yaw: int
-    scale: int
-    goal: int  # distance [m] and direction [rad] from the object's first place
-    goal_yaw: int  # relative to its first yaw [rad]
-
-
-@wp.struct
-class Columns:
-    """Columns of the observation."""
-
-    goal: int
-    goal_heading: int
-    goal_offset: int
-    object_goal: int
-    object_heading: int
-    push_offset: int
-
-
-@wp.struct
 class Plan:
     """Columns, where the tool pushes, and when the goal is met."""
 
-    drawn: Drawn
-    columns: Columns
+    drawn_position: int
+    drawn_yaw: int
+    drawn_scale: int
+    drawn_goal: int  # distance [m] and direction [rad] from the object's first place
+    drawn_goal_yaw: int  # relative to its first yaw [rad]
+    column_goal: int
+    column_goal_heading: int
+    column_goal_offset: int
+    column_object_goal: int
+    column_object_heading: int
+    column_push_offset: int
     rest: wp.array2d[wp.vec3]  # of the observed points, relative to the centre of mass [m], (world_count, points)
     before: wp.array[float]  # distance one step earlier [m], negative in the first step
     push_distances: wp.array[float]  # from the unscaled object's centre to the tool behind it [m]
@@ -56,13 +42,13 @@ class Plan:
 def observe(state: WorldState, plan: Plan, result: StepResult):
     """Write the goal, the ways of object and tool, distance and error of yaw."""
     w = wp.tid()
-    reach = state.parameters[w, plan.drawn.goal]
-    direction = state.parameters[w, plan.drawn.goal + 1]
+    reach = state.parameters[w, plan.drawn_goal]
+    direction = state.parameters[w, plan.drawn_goal + 1]
     goal = wp.vec2(
-        state.parameters[w, plan.drawn.position] + reach * wp.cos(direction),
-        state.parameters[w, plan.drawn.position + 1] + reach * wp.sin(direction),
+        state.parameters[w, plan.drawn_position] + reach * wp.cos(direction),
+        state.parameters[w, plan.drawn_position + 1] + reach * wp.sin(direction),
     )
-    yaw = state.parameters[w, plan.drawn.yaw] + state.parameters[w, plan.drawn.goal_yaw]
+    yaw = state.parameters[w, plan.drawn_yaw] + state.parameters[w, plan.drawn_goal_yaw]
     c = wp.cos(yaw)
     s = wp.sin(yaw)
     x = state.object_position[w, 0]
@@ -80,14 +66,14 @@ def observe(state: WorldState, plan: Plan, result: StepResult):
     way = goal - wp.vec2(x[0], x[1])
     distance = wp.length(way)
     towards = way / wp.max(distance, 1.0e-6)
-    back = plan.push_distances[w] * state.parameters[w, plan.drawn.scale]
+    back = plan.push_distances[w] * state.parameters[w, plan.drawn_scale]
     push = wp.vec3(x[0] - back * towards[0], x[1] - back * towards[1], plan.push_height)
-    write(result.observation, w, plan.columns.goal, goal)
-    write(result.observation, w, plan.columns.goal_heading, wp.vec2(c, s))
-    write(result.observation, w, plan.columns.goal_offset, goal - wp.vec2(tool[0], tool[1]))
-    write(result.observation, w, plan.columns.object_goal, way)
-    write(result.observation, w, plan.columns.object_heading, wp.vec2(along / length, across / length))
-    write(result.observation, w, plan.columns.push_offset, push - tool)
+    write(result.observation, w, plan.column_goal, goal)
+    write(result.observation, w, plan.column_goal_heading, wp.vec2(c, s))
+    write(result.observation, w, plan.column_goal_offset, goal - wp.vec2(tool[0], tool[1]))
+    write(result.observation, w, plan.column_object_goal, way)
+    write(result.observation, w, plan.column_object_heading, wp.vec2(along / length, across / length))
+    write(result.observation, w, plan.column_push_offset, push - tool)
     result.metrics[w, Metric.goal_distance] = distance
     result.metrics[w, Metric.yaw_error] = wp.abs(wp.atan2(across, along))
     turn = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), yaw)
@@ -100,7 +86,7 @@ def evaluate(state: WorldState, plan: Plan, result: StepResult):
     w = wp.tid()
     distance = result.metrics[w, Metric.goal_distance]
     yaw_error = result.metrics[w, Metric.yaw_error]
-    p = plan.columns.push_offset
+    p = plan.column_push_offset
     push = wp.vec3(result.observation[w, p], result.observation[w, p + 1], result.observation[w, p + 2])
     there = distance <= plan.goal_tolerance
     nearness = 1.0 - wp.tanh(10.0 * distance)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.envs.scripted_base import Environment, ScriptedPolicy, Vector, half_turn
+from softmode.envs.scripted import Environment, ScriptedPolicy, Vector, half_turn
 from softmode.envs.tasks.push_soft.task import PushSoft
 from softmode.robots.table_robot import tip_length
 

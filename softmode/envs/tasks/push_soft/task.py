@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,10 +12,10 @@ from scipy.spatial import ConvexHull
 from softmode.checks import require_fields, require_number, require_range
 from softmode.deformables.materials.material import Material
 from softmode.deformables.reduction.options import BuildOptions
-from softmode.envs.clutter import Arcs
 from softmode.envs.markers import dots
 from softmode.envs.observation import Segment
 from softmode.envs.parameters import Parameter
+from softmode.envs.placement import Arcs
 from softmode.envs.presets import RL_SOLVER
 from softmode.envs.soft_env import SoftEnv
 from softmode.envs.soft_vector_env import SoftVectorEnv
@@ -29,7 +28,7 @@ from softmode.objects.soft_object import SoftObject
 from softmode.robots.arm import ArmDescription
 from softmode.robots.control import ArmControlOptions
 from softmode.robots.table_robot import TableRobot
-from softmode.scenes.table_scene import TableSceneConfig
+from softmode.scenes.table_scene import Marker, TableSceneConfig
 from softmode.splats.splats import Splats
 
 PUCK = ObjectConfig(
@@ -109,7 +108,7 @@ class PushSoft(Task):
 
     config: PushSoftConfig
     config_class = PushSoftConfig
-    kernels = kernels
+    step_kernels = (kernels.observe, kernels.evaluate)
     takes_sets = True
     takes_several = True
     any_robot = True
@@ -119,15 +118,15 @@ class PushSoft(Task):
     def build(self) -> None:
         """Allocate what the reward remembers."""
         self.before = wp.zeros(self.world_count, dtype=float, device=self.device)
-        surfaces = [thing.body.surface_points for thing in self.scene.members]
-        rest = [surface[points] for surface, points in zip(surfaces, self._points, strict=True)]
-        self.rest = self.per_object(np.stack(rest), wp.vec3)
+        surfaces = [thing.body.surface_points for thing in self.scene.occupancy.choices]
+        rest = [surface[points] for surface, points in zip(surfaces, self.points_of_choices, strict=True)]
+        self.rest = self.scene.occupancy.follow(np.stack(rest), wp.vec3)
         self.yaw_tolerance = -1.0 if self.config.yaw_tolerance is None else self.config.yaw_tolerance
         arm = self.config.scene.arm
         width = arm.jaw.finger_width if isinstance(arm, TableRobot) else arm.gripper.pad_size[0]
         radii = [float(np.linalg.norm(points[:, :2], axis=1).max() + 0.5 * width) for points in surfaces]
         self._push_distances = np.array(radii)
-        self.push_distances = self.per_object(self._push_distances)
+        self.push_distances = self.scene.occupancy.follow(self._push_distances)
         """From the centre of each unscaled object to the tool that pushes it [m], shape (world_count,)."""
         self.push_height = self.config.scene.control.workspace_lower[2] + 0.006
         """Height of the tool that pushes [m]."""
@@ -135,7 +134,7 @@ class PushSoft(Task):
     @property
     def push_distance(self) -> NDArray[np.float64]:
         """The same on the host."""
-        return self._push_distances[self.scene.member]
+        return self._push_distances[self.scene.occupancy.rows]
 
     def other_arcs(self) -> Arcs:
         """Return the directions beside the ways to the goal and beside the tool, which comes from the robot."""
@@ -178,9 +177,9 @@ class PushSoft(Task):
         """Add how far the object was from its goal a step ago."""
         return {**super().state_arrays(), "before": self.before}
 
-    def marker(self) -> Splats | Sequence[Splats]:
-        """Return the outline of the object, to be drawn on the table; a list where the worlds differ."""
-        return self.marker_per_object(_outline)
+    def marker(self) -> Marker:
+        """Return what draws the outline of an object, to lie on the table."""
+        return _outline
 
 
 def _outline(thing: SoftObject) -> Splats:
@@ -196,15 +195,9 @@ def _outline(thing: SoftObject) -> Splats:
     return dots(np.column_stack([outline, np.full(len(outline), 0.001)]), 0.0018, opacity=0.8)
 
 
-class PushSoftEnv(SoftEnv):
+class PushSoftEnv(SoftEnv[PushSoft]):
     """One arm, one soft object, one goal on the table; see :class:`PushSoft` and :class:`SoftEnv`."""
 
-    config: PushSoftConfig
-    task: PushSoft
-    task_class = PushSoft
 
-
-class PushSoftVectorEnv(SoftVectorEnv):
+class PushSoftVectorEnv(SoftVectorEnv[PushSoft]):
     """Many worlds of it; see :class:`PushSoft` and :class:`SoftVectorEnv`."""
-
-    task_class = PushSoft

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from softmode.envs.position_goals import PositionGoalMethods, PositionGoals
+from softmode.envs.goals import PositionGoalMethods, PositionGoals
 from softmode.envs.soft_env import SoftEnv
 from softmode.envs.soft_vector_env import SoftVectorEnv
 from softmode.envs.tasks.push_soft.task import PushSoft, PushSoftConfig
@@ -38,18 +38,9 @@ class PushSoftGoal(PositionGoals, PushSoft):
     goal_size = 2
 
 
-class PushSoftGoalEnv(PositionGoalMethods, SoftEnv):
+class PushSoftGoalEnv(PositionGoalMethods, SoftEnv[PushSoftGoal]):
     """The environment of one world; see :class:`PushSoftGoal` and :class:`SoftEnv`."""
 
-    config: PushSoftGoalConfig
-    task: PushSoftGoal
-    task_class = PushSoftGoal
-    goal_size = 2
 
-
-class PushSoftGoalVectorEnv(PositionGoalMethods, SoftVectorEnv):
+class PushSoftGoalVectorEnv(PositionGoalMethods, SoftVectorEnv[PushSoftGoal]):
     """Many worlds of it; see :class:`PushSoftGoal` and :class:`SoftVectorEnv`."""
-
-    config: PushSoftGoalConfig
-    task_class = PushSoftGoal
-    goal_size = 2

@@ -13,31 +13,10 @@ Metric = IntEnum("Metric", "goal_distance least_winding highest_point grasp_dist
 
 
 @wp.struct
-class Drawn:
-    """Columns of the parameters."""
-
-    route: int
-    goal: int  # aside of the last peg, and beyond it [m]
-
-
-@wp.struct
-class Columns:
-    """Columns of the observation."""
-
-    goal: int
-    goal_offset: int
-    side: int
-    grasp_offset: int
-    end_offset: int
-    end_goal: int
-    winding: int
-
-
-@wp.struct
 class Ropes:
     """Points on the axes of the ropes that worlds may have."""
 
-    member: wp.array[int]  # which rope each world has, (world_count,)
+    choice: wp.array[int]  # which rope each world has, (world_count,)
     rest: wp.array2d[wp.vec3d]  # (ropes, points) [m]
     basis: wp.array3d[wp.float64]  # there, (ropes, points, functions)
     function_count: wp.array[int]  # of each rope
@@ -47,8 +26,15 @@ class Ropes:
 class Plan:
     """Columns, the rope's axis, the pegs, and when the goal is met."""
 
-    drawn: Drawn
-    columns: Columns
+    drawn_route: int
+    drawn_goal: int  # aside of the last peg, and beyond it [m]
+    column_goal: int
+    column_goal_offset: int
+    column_side: int
+    column_grasp_offset: int
+    column_end_offset: int
+    column_end_goal: int
+    column_winding: int
     rest_height: wp.array[float]  # of the unscaled rope's axis [m], (world_count,)
     grasp_point: wp.array[int]  # index of the axis point to grasp, (world_count,)
     axis: wp.array2d[wp.vec3]  # from tail to end [m]
@@ -70,9 +56,9 @@ def peg_side(route: float, peg: int):
 def rope_goal(state: WorldState, plan: Plan, world: int):
     """Return where the rope's end is to lie [m]: aside of the last peg, on the rope's side, and beyond it along y."""
     last = plan.peg_position.shape[0] - 1
-    side = peg_side(state.parameters[world, plan.drawn.route], last)
-    aside = side * state.parameters[world, plan.drawn.goal]
-    return plan.peg_position[last] + wp.vec2(aside, state.parameters[world, plan.drawn.goal + 1])
+    side = peg_side(state.parameters[world, plan.drawn_route], last)
+    aside = side * state.parameters[world, plan.drawn_goal]
+    return plan.peg_position[last] + wp.vec2(aside, state.parameters[world, plan.drawn_goal + 1])
 
 
 @wp.func
@@ -91,7 +77,7 @@ def trace_axis(
     """Deform the points of the axis: x = X + sum_k b_k(X) q_k."""
     w, i = wp.tid()
     start = state.function_start[w]
-    b = ropes.member[w]
+    b = ropes.choice[w]
     x = ropes.rest[b, i]
     for k in range(ropes.function_count[b]):
         x += ropes.basis[b, i, k] * state.q[start + k]
@@ -107,11 +93,11 @@ def observe(state: WorldState, plan: Plan, result: StepResult):
     points = plan.axis.shape[1]
     end = plan.axis[w, points - 1]
     grasp = plan.axis[w, plan.grasp_point[w]]
-    write(result.observation, w, plan.columns.goal, goal)
-    write(result.observation, w, plan.columns.goal_offset, goal - wp.vec2(tool[0], tool[1]))
-    write(result.observation, w, plan.columns.grasp_offset, grasp - tool)
-    write(result.observation, w, plan.columns.end_offset, end - grasp)
-    write(result.observation, w, plan.columns.end_goal, goal - wp.vec2(end[0], end[1]))
+    write(result.observation, w, plan.column_goal, goal)
+    write(result.observation, w, plan.column_goal_offset, goal - wp.vec2(tool[0], tool[1]))
+    write(result.observation, w, plan.column_grasp_offset, grasp - tool)
+    write(result.observation, w, plan.column_end_offset, end - grasp)
+    write(result.observation, w, plan.column_end_goal, goal - wp.vec2(end[0], end[1]))
     least = float(1.0e9)
     for p in range(plan.peg_position.shape[0]):
         peg = plan.peg_position[p]
@@ -121,9 +107,9 @@ def observe(state: WorldState, plan: Plan, result: StepResult):
             after = wp.vec2(plan.axis[w, i][0], plan.axis[w, i][1]) - peg
             angle += turn(before, after)
             before = after
-        side = peg_side(state.parameters[w, plan.drawn.route], p)
-        result.observation[w, plan.columns.side + p] = side
-        result.observation[w, plan.columns.winding + p] = side * angle
+        side = peg_side(state.parameters[w, plan.drawn_route], p)
+        result.observation[w, plan.column_side + p] = side
+        result.observation[w, plan.column_winding + p] = side * angle
         least = wp.min(least, side * angle)
     top = float(0.0)
     for i in range(points):
@@ -144,7 +130,7 @@ def evaluate(state: WorldState, plan: Plan, result: StepResult):
     pegs = plan.peg_position.shape[0]
     passed = float(0.0)
     for p in range(pegs):
-        passed += wp.clamp(result.observation[w, plan.columns.winding + p] / plan.winding, -1.0, 1.0) / float(pegs)
+        passed += wp.clamp(result.observation[w, plan.column_winding + p] / plan.winding, -1.0, 1.0) / float(pegs)
     low = result.metrics[w, Metric.highest_point] < plan.peg_height
     routed = low and result.metrics[w, Metric.least_winding] >= plan.winding
     there = routed and distance <= plan.goal_tolerance

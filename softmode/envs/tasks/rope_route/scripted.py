@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softmode.envs.reward_kernels import TOUCH_FORCE
-from softmode.envs.scripted_base import Environment, ScriptedPolicy, Vector, bounded
+from softmode.envs.scripted import Environment, ScriptedPolicy, Vector, bounded
 from softmode.envs.tasks.rope_route.task import RopeRoute
 
 
@@ -50,7 +50,7 @@ class ScriptedRope(ScriptedPolicy):
         """Return the action for the present state."""
         task, control, tool, force = self.task, self.control, self.tool, self.weaker_force
         axis = task.axis.numpy()[self.world].astype(float)
-        point = int(task.grasp_points[self.scene.member[self.world]])
+        point = int(task.grasp_points[self.scene.occupancy.rows[self.world]])
         grasp, end = axis[point], axis[-1]
         lowest = control.workspace_lower[2]
         along = end - axis[point - 2]

@@ -141,7 +141,7 @@ class RopeRoute(Task):
 
     config: RopeRouteConfig
     config_class = RopeRouteConfig
-    kernels = kernels
+    step_kernels = (kernels.observe, kernels.evaluate)
     takes_sets = True
     grasps = True
     term_names = tuple(kernels.Term.__members__)
@@ -149,23 +149,23 @@ class RopeRoute(Task):
 
     def build(self) -> None:
         """Sample the axes."""
-        device, bodies = self.device, [thing.body for thing in self.scene.members]
+        device, bodies = self.device, [thing.body for thing in self.scene.occupancy.choices]
         self._check_ropes(bodies)
         halves = np.array([0.5 * (body.bounds[1][0] - body.bounds[0][0]) for body in bodies])
-        self.half_length = self.per_object(halves)
+        self.half_length = self.scene.occupancy.follow(halves)
         """Half of the length of every unscaled rope [m], shape (world_count,)."""
         rest = np.zeros((len(bodies), AXIS_POINTS, 3))
         rest[:, :, 0] = [np.linspace(-half, half, AXIS_POINTS) for half in halves]
         self.grasp_points = np.argmin(np.abs(rest[:, :, 0] - (halves - GRASP)[:, None]), axis=1)
-        """Index of the axis point to grasp, of every member of the scene."""
-        self.grasp_point = self.per_object(self.grasp_points, int)
+        """Index of the axis point to grasp, of every choice of the scene."""
+        self.grasp_point = self.scene.occupancy.follow(self.grasp_points, int)
         counts = [body.function_count for body in bodies]
         basis = np.zeros((len(bodies), AXIS_POINTS, max(counts)))
         for b, body in enumerate(bodies):
             basis[b, :, : counts[b]] = body.evaluate(rest[b])[0]
         self._ropes = filled(
             kernels.Ropes,
-            member=self.per_object(np.arange(len(bodies)), int),
+            choice=self.scene.occupancy.follow(np.arange(len(bodies)), int),
             rest=wp.array(rest, dtype=wp.vec3d, device=device),
             basis=wp.array(basis, dtype=wp.float64, device=device),
             function_count=wp.array(counts, dtype=int, device=device),
@@ -182,7 +182,7 @@ class RopeRoute(Task):
         Raises:
             ConfigError: If a body is no rope; it names the object.
         """
-        for name, body in zip(self.member_names, bodies, strict=True):
+        for name, body in zip(self.scene.occupancy.names, bodies, strict=True):
             length = float(np.ptp(body.surface_points[:, 0]))
             width = 2.0 * float(np.linalg.norm(body.surface_points[:, 1:], axis=1).max())
             if length < SLENDER * width:
@@ -221,7 +221,7 @@ class RopeRoute(Task):
 
     def place(self) -> None:
         """Put the rope down along y, its end where the position says."""
-        self.place_object(0, "position", "yaw", turn=0.5 * np.pi, shift=self.half_length)
+        self.placement.put(0, turn=0.5 * np.pi, shift=self.half_length)
 
     def observe(self) -> None:
         """Trace the axis and write goal, end and winding."""
@@ -237,15 +237,9 @@ class RopeRoute(Task):
         return square_camera(name, edge, (0.95, -0.50, 0.62), (0.44, -0.10, 0.02), 0.68)
 
 
-class RopeRouteEnv(SoftEnv):
+class RopeRouteEnv(SoftEnv[RopeRoute]):
     """One arm, one rope, some pegs; see :class:`RopeRoute` and :class:`SoftEnv`."""
 
-    config: RopeRouteConfig
-    task: RopeRoute
-    task_class = RopeRoute
 
-
-class RopeRouteVectorEnv(SoftVectorEnv):
+class RopeRouteVectorEnv(SoftVectorEnv[RopeRoute]):
     """Many worlds of it; see :class:`RopeRoute` and :class:`SoftVectorEnv`."""
-
-    task_class = RopeRoute

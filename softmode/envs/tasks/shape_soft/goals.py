@@ -29,7 +29,6 @@ class ShapeGoals(GoalMethods):
     """Rewards of shapes, by their points relative to the middle of the foot, or by their masses."""
 
     config: ShapeSoftConfig
-    goal_size = 3 * POINTS
 
     def launch_reward(self, achieved: wp.array, desired: wp.array, reward: wp.array) -> None:
         """Compute the rewards of pairs of shapes."""

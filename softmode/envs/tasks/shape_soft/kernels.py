@@ -17,31 +17,12 @@ Metric = IntEnum("Metric", "shape_error", start=0)
 
 
 @wp.struct
-class Drawn:
-    """Columns of the parameters."""
-
-    position: int
-    yaw: int
-    goal: int  # displacement [m] and direction [rad]
-
-
-@wp.struct
-class Columns:
-    """Columns of the observation."""
-
-    tool_position: int  # the first one of proprioception
-    desired_goal: int
-    achieved_goal: int
-    arm: int
-
-
-@wp.struct
 class Target:
     """Recorded presses along y; see `targets.ShapeTargets`."""
 
-    points: wp.array4d[wp.vec3]  # (members, directions, levels, points) [m]
-    displacement_max: wp.array[float]  # of the last level [m], (members,)
-    member: wp.array[int]  # whose press the target of a world is, (world_count,)
+    points: wp.array4d[wp.vec3]  # (choices, directions, levels, points) [m]
+    displacement_max: wp.array[float]  # of the last level [m], (choices,)
+    choice: wp.array[int]  # whose press the target of a world is, (world_count,)
 
 
 @wp.struct
@@ -60,11 +41,13 @@ class Rules:
 class Plan:
     """Columns, the recorded press, and what the reward depends on."""
 
-    drawn: Drawn
-    columns: Columns
+    drawn_position: int
+    drawn_yaw: int
+    drawn_goal: int  # displacement [m] and direction [rad]
+    column_desired_goal: int
+    column_achieved_goal: int
     target: Target
     rules: Rules
-    arm_size: int  # how much proprioception is
 
 
 @wp.func
@@ -73,15 +56,15 @@ def target_point(state: WorldState, plan: Plan, w: int, i: int):
 
     A post at yaw psi that is pressed in direction alpha + 90 degrees: R(alpha) x(R(psi - alpha) X), x the press.
     """
-    b = plan.target.member[w]
+    b = plan.target.choice[w]
     directions = plan.target.points.shape[1]
     levels = plan.target.points.shape[2]
-    alpha = state.parameters[w, plan.drawn.goal + 1] - 0.25 * TURN
-    turns = (state.parameters[w, plan.drawn.yaw] - alpha) / TURN
+    alpha = state.parameters[w, plan.drawn_goal + 1] - 0.25 * TURN
+    turns = (state.parameters[w, plan.drawn_yaw] - alpha) / TURN
     at = (turns - wp.floor(turns)) * float(directions)
     j = wp.min(int(at), directions - 1)
     u = at - float(j)
-    displacement = state.parameters[w, plan.drawn.goal] / plan.target.displacement_max[b]
+    displacement = state.parameters[w, plan.drawn_goal] / plan.target.displacement_max[b]
     depth = wp.clamp(displacement, 0.0, 1.0) * float(levels - 1)
     k = wp.min(int(depth), levels - 2)
     v = depth - float(k)
@@ -97,7 +80,7 @@ def target_point(state: WorldState, plan: Plan, w: int, i: int):
 @wp.func
 def foot_position(state: WorldState, plan: Plan, w: int):
     """Return the middle of the foot, on the table [m]."""
-    return wp.vec3(state.parameters[w, plan.drawn.position], state.parameters[w, plan.drawn.position + 1], 0.0)
+    return wp.vec3(state.parameters[w, plan.drawn_position], state.parameters[w, plan.drawn_position + 1], 0.0)
 
 
 @wp.func
@@ -197,18 +180,16 @@ def observe_points(state: WorldState, plan: Plan, result: StepResult):
     """Write a point of the target shape and where it is now, relative to the foot on the table."""
     w, i = wp.tid()
     now = surface_point(state, w, i) - foot_position(state, plan, w)
-    write(result.observation, w, plan.columns.desired_goal + 3 * i, target_point(state, plan, w, i))
-    write(result.observation, w, plan.columns.achieved_goal + 3 * i, now)
+    write(result.observation, w, plan.column_desired_goal + 3 * i, target_point(state, plan, w, i))
+    write(result.observation, w, plan.column_achieved_goal + 3 * i, now)
 
 
 @wp.kernel
 def observe(state: WorldState, plan: Plan, result: StepResult):
-    """Write the error, and proprioception once more."""
+    """Write the error."""
     w = wp.tid()
-    for k in range(plan.arm_size):
-        result.observation[w, plan.columns.arm + k] = result.observation[w, plan.columns.tool_position + k]
     seen = result.observation
-    error = goal_error(seen, plan.columns.achieved_goal, seen, plan.columns.desired_goal, plan.rules, w)
+    error = goal_error(seen, plan.column_achieved_goal, seen, plan.column_desired_goal, plan.rules, w)
     result.metrics[w, Metric.shape_error] = error
 
 
@@ -233,7 +214,7 @@ def evaluate(state: WorldState, plan: Plan, result: StepResult):
     """Reward nearness to the target shape, and being there."""
     w = wp.tid()
     seen = result.observation  # bounded by now, as the goals are that learners compute rewards from
-    error = goal_error(seen, plan.columns.achieved_goal, seen, plan.columns.desired_goal, plan.rules, w)
+    error = goal_error(seen, plan.column_achieved_goal, seen, plan.column_desired_goal, plan.rules, w)
     pair = reward_terms(error, plan.rules)
     result.terms[w, Term.shape] = pair[0]
     result.terms[w, Term.there] = pair[1]

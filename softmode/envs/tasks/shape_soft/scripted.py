@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.envs.scripted_base import Environment, ScriptedPolicy, bounded, half_turn
+from softmode.envs.scripted import Environment, ScriptedPolicy, bounded, half_turn
 from softmode.envs.tasks.shape_soft.task import ShapeSoft
 
 
@@ -37,9 +37,9 @@ class ScriptedShape(ScriptedPolicy):
 
     def _ends(self) -> list[NDArray[np.bool_]]:
         """Return which points are at the free end, of the target and of the post."""
-        task, world = self.task, self.world
-        bent = self.soft.body.surface_points[task.points_of_worlds[world]]
-        return [rest[:, 2] > rest[:, 2].max() - 0.02 for rest in (task.goal_rests[self.scene.member[world]], bent)]
+        task, row = self.task, self.scene.occupancy.rows[self.world]
+        bent = self.soft.body.surface_points[task.points_of_choices[row]]
+        return [rest[:, 2] > rest[:, 2].max() - 0.02 for rest in (task.goal_rests[row], bent)]
 
     def __call__(self, observation: object = None) -> NDArray[np.float32]:
         """Return the action for the present state."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +12,7 @@ from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.body.rkpm import sample_farthest
 from softmode.deformables.model.structs import filled
 from softmode.envs.markers import dots
-from softmode.envs.observation import PROPRIOCEPTION, Segment
+from softmode.envs.observation import Segment, goal_part
 from softmode.envs.parameters import Parameter
 from softmode.envs.soft_env import SoftEnv
 from softmode.envs.soft_vector_env import SoftVectorEnv
@@ -25,7 +24,7 @@ from softmode.envs.tasks.shape_soft.targets import Press, ShapeTargets, record_p
 from softmode.errors import ConfigError
 from softmode.objects.loader import load
 from softmode.objects.soft_object import SoftObject
-from softmode.scenes.table_scene import TableScene
+from softmode.scenes.table_scene import Marker, TableScene
 from softmode.splats.splats import Splats
 
 
@@ -44,20 +43,21 @@ class ShapeSoft(Task):
 
     config: ShapeSoftConfig
     config_class = ShapeSoftConfig
-    kernels = kernels
+    step_kernels = (kernels.observe, kernels.evaluate)
     takes_sets = True
     term_names = tuple(kernels.Term.__members__)
     metric_names = tuple(kernels.Metric.__members__)
     point_count = POINTS
+    goal_size = 3 * POINTS
 
     def build(self) -> None:
         """Record the targets."""
         scene = self.scene
-        members = range(len(scene.members))
-        presses = [self._record(m) for m in members]
+        choices = range(len(scene.occupancy.choices))
+        presses = [self._record(c) for c in choices]
         rests = [body.surface_points[chosen] for body, _, chosen in presses]
         self.goal_rests = tuple(rests)
-        """Rest points of the targets in the frame of their body [m], one of shape (points, 3) per member."""
+        """Rest points of the targets in the frame of their body [m], one of shape (points, 3) per choice."""
         if scene.splats is not None:  # the marker shows the whole surface
             rests = [
                 np.concatenate([rest, body.surface_points]) for rest, (body, *_) in zip(rests, presses, strict=True)
@@ -66,31 +66,32 @@ class ShapeSoft(Task):
             scene.marker_points = wp.zeros(shape, dtype=wp.vec3, device=self.device)
         pressed = [(body, press, rest) for (body, press, _), rest in zip(presses, rests, strict=True)]
         self.targets = ShapeTargets.from_presses(pressed, self.device)
-        self.target = filled(kernels.Target, self.targets, member=self.per_object(np.array(members), int))
+        self.target = filled(kernels.Target, self.targets, choice=scene.occupancy.follow(choices, int))
         self.rules = reward_rules(self.config)
-        self.arm_size = self.segments["arm"][1].size
 
-    def _record(self, member: int) -> tuple[ReducedBody, Press, NDArray[np.intp]]:
-        """Press what makes the targets of a member of the scene; return its body, the press and the points chosen.
+    def _record(self, choice: int) -> tuple[ReducedBody, Press, NDArray[np.intp]]:
+        """Press what makes the targets of a choice of the scene; return its body, the press and the points chosen.
 
         Raises:
             ConfigError: If the arm does not bend it far enough; it names the object of a set.
         """
         scene, goal = self.scene, self.config.goal_object
-        if self.object_set is not None or goal is not None:  # on its own, so that a target depends on its object alone
+        if self.config.object_set is not None or goal is not None:  # so that a target depends on its object alone
             alone = replace(
                 self.scene_config(),
-                object=goal or scene.members[member].config,
+                object=goal or scene.occupancy.choices[choice].config,
                 objects=None,
-                material=scene.materials[member],
+                material=scene.occupancy.materials[choice],
             )
             scene = TableScene(alone, device=self.device)
         body = scene.soft.body
-        points = self._points[member] if goal is None else sample_farthest(body.surface_points, POINTS, first=0)
+        points = self.points_of_choices[choice]
+        if goal is not None:
+            points = sample_farthest(body.surface_points, POINTS, first=0)
         try:
             return body, record_press(scene, self.config.goal_displacement[1]), points
         except ConfigError as error:
-            raise ConfigError(f"{self.member_names[member]}: {error.message}", hint=error.hint) from error
+            raise ConfigError(f"{self.scene.occupancy.names[choice]}: {error.message}", hint=error.hint) from error
 
     def parameters(self) -> tuple[Parameter, ...]:
         """Add the goal: displacement of the free end [m] and direction [rad]."""
@@ -101,20 +102,11 @@ class ShapeSoft(Task):
 
     def goal_segments(self) -> tuple[Segment, ...]:
         """The points of the target shape [m]."""
-        return (Segment("desired_goal", 3 * self.point_count, -2.0, 2.0),)
+        return (Segment("desired_goal", self.goal_size, -2.0, 2.0),)
 
     def object_segments(self) -> tuple[Segment, ...]:
-        """Proprioception again, so that what does not depend on the goal is one range, and the points now [m]."""
-        low, high = (np.concatenate(part) for part in zip(*(s.bounds() for s in PROPRIOCEPTION), strict=True))
-        return (
-            Segment("arm", len(low), tuple(low.tolist()), tuple(high.tolist())),
-            Segment("achieved_goal", 3 * self.point_count, -2.0, 2.0),
-        )
-
-    def state_keys(self) -> dict[str, slice]:
-        """Return the columns of observation and goals."""
-        goals = {name: self.segments[name][0] for name in ("achieved_goal", "desired_goal")}
-        return {"observation": slice(self.column("object_position"), self.column("achieved_goal")), **goals}
+        """The points now [m]."""
+        return goal_part(self.scene.controller.joint_count, self.goal_size)
 
     def observe(self) -> None:
         """Write both goals and the error."""
@@ -125,12 +117,12 @@ class ShapeSoft(Task):
             points, inputs = self.scene.marker_points, [self.state, self.plan, self.point_count]
             self.launch(kernels.shape_marker, inputs, [points, self.result], points.shape)
 
-    def marker(self) -> Splats | Sequence[Splats]:
-        """Return the surface of the body that makes the targets; `observe` bends it. A list where the worlds differ."""
+    def marker(self) -> Marker:
+        """Return the surface of what makes the targets, or what draws that of an object; `observe` bends it."""
         goal = self.config.goal_object
         if goal is not None:
             return _surface(load(goal, material=self.config.scene.material))
-        return self.marker_per_object(_surface)
+        return _surface
 
 
 def _surface(thing: SoftObject) -> Splats:
@@ -138,16 +130,9 @@ def _surface(thing: SoftObject) -> Splats:
     return dots(thing.body.surface_points, 0.004, opacity=0.35)
 
 
-class ShapeSoftEnv(ShapeGoals, SoftEnv):
+class ShapeSoftEnv(ShapeGoals, SoftEnv[ShapeSoft]):
     """One arm, one soft post, one target shape; see :class:`ShapeSoft` and :class:`SoftEnv`."""
 
-    config: ShapeSoftConfig
-    task: ShapeSoft
-    task_class = ShapeSoft
 
-
-class ShapeSoftVectorEnv(ShapeGoals, SoftVectorEnv):
+class ShapeSoftVectorEnv(ShapeGoals, SoftVectorEnv[ShapeSoft]):
     """Many worlds of it; see :class:`ShapeSoft` and :class:`SoftVectorEnv`."""
-
-    config: ShapeSoftConfig
-    task_class = ShapeSoft

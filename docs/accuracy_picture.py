@@ -1,14 +1,17 @@
 """Draw accuracy against unknowns and against time from the output of `benchmarks.accuracy`.
 
-Run: ``python -m benchmarks.accuracy_picture [out/accuracy.json] [docs/images/accuracy.png]``; needs matplotlib.
+Run: ``python docs/accuracy_picture.py [out/accuracy.json] [docs/images/accuracy.png]``; needs matplotlib.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import sys
 from pathlib import Path
 from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # for the benchmarks
 
 from benchmarks.accuracy import FREEFORM, MODES, SIMPLICITS
 

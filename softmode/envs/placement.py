@@ -1,4 +1,4 @@
-"""Where objects of a set lie beside object 0: places on rings about it, so that none begins in another."""
+"""Where objects are put down at a reset: by their parameters, and those of a set about object 0, none in another."""
 
 from __future__ import annotations
 
@@ -6,14 +6,19 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
+from typing import Any
 
 import numpy as np
+import warp as wp
 
-from softmode.envs.parameters import Parameter
+from softmode.deformables.model.declare import launch
+from softmode.deformables.model.structs import filled
+from softmode.envs import task_kernels as kernels
+from softmode.envs.parameters import Parameter, ParameterTable
 from softmode.envs.task_config import TaskConfig
 from softmode.errors import ConfigError
-from softmode.objects.soft_object import SoftObject
-from softmode.scenes.table_scene import TABLE_PLACE, TABLE_SIZE
+from softmode.scenes.occupancy import Occupancy
+from softmode.scenes.table_scene import GAP, TABLE_PLACE, TABLE_SIZE, TableScene
 
 BASE = 0.12
 """Half of the edges of the square about the robot's base in which nothing lies [m]."""
@@ -76,24 +81,24 @@ def _row(low: float, high: float, number: int, half: float, distance: float) -> 
     return [Place(low + (k + 0.5) * width, play, distance) for k in range(number)]
 
 
-def clutter_parameters(
-    config: TaskConfig, count: int, members: Sequence[SoftObject], arcs: Arcs
-) -> tuple[Parameter, ...]:
+def clutter_parameters(config: TaskConfig, held: Occupancy, arcs: Arcs) -> tuple[Parameter, ...]:
     """Return what is drawn of the objects beside object 0: `others_turn`, and for each `other_place_k`, `other_yaw_k`.
 
     A place is a direction [rad], which the turn is added to, and a distance [m] from object 0.
 
     Args:
         config: The task's configuration.
-        count: How many there may be.
-        members: What each may be.
-        arcs: Where they may lie.
+        held: What the worlds hold; nothing is drawn where they have room for one object.
+        arcs: Where the others may lie.
 
     Raises:
         ConfigError: If so many do not fit on the table.
     """
+    count = held.slots - 1
+    if not count:
+        return ()
     scale = (config.scale_range or (1.0, 1.0))[1]
-    radius = scale * max(float(np.linalg.norm(one.body.surface_points[:, :2], axis=1).max()) for one in members)
+    radius = scale * max(float(np.linalg.norm(one.body.surface_points[:, :2], axis=1).max()) for one in held.choices)
     spread = 0.5 * config.others_clearance
     places = ring_places(count, 2.0 * radius + config.others_clearance, spread, arcs)
     _check_table(config, places, radius, spread, arcs)
@@ -142,3 +147,66 @@ def _check_table(config: TaskConfig, places: Sequence[Place], radius: float, spr
             f"{len(places) + 1} objects of radius up to {radius:.3f} m do not fit {where}",
             hint="make objects.per_world, the objects, others_clearance or position_range smaller",
         )
+
+
+class Placement:
+    """Puts the objects of the worlds that are reset down, where their parameters say.
+
+    Args:
+        scene: The scene.
+        table: The parameters.
+        state: The task's `WorldState`.
+
+    Attributes:
+        heights: Heights of the centres of the unscaled objects at rest [m], shape (world_count, objects).
+    """
+
+    def __init__(self, scene: TableScene, table: ParameterTable, state: Any) -> None:
+        """Find the heights and columns."""
+        held = scene.occupancy
+        others = [thing.height for thing in held.others]
+        heights = [[*[thing.height] * held.slots, *others] for thing in held.choices]
+        self.heights = held.follow(heights, every_slot=held.slots > 1)
+        self._scene, self._table, self._state, self._beside = scene, table, state, held.slots - 1
+        self._no_shift = wp.zeros(scene.world_count, dtype=float, device=scene.device)
+
+    def put(
+        self,
+        index: int,
+        position: str = "position",
+        yaw: str = "yaw",
+        *,
+        ground: float = 0.0,
+        turn: float = 0.0,
+        shift: wp.array | None = None,
+    ) -> None:
+        """Put an object down; capturable.
+
+        Args:
+            index: Which object of a world.
+            position: The parameter that says where its centre is [m].
+            yaw: The one that says its rotation about the vertical [rad].
+            ground: Height over the table of what it stands on [m].
+            turn: What is added to the yaw [rad].
+            shift: From the centre of the unscaled object to what lies at the position, along the yaw [m], shape
+                (world_count,); None for the centre itself.
+        """
+        scene, names = self._scene, {"position": position, "yaw": yaw, "scale": "scale"}
+        columns = {field: self._table.column(name) for field, name in names.items()}
+        shift = self._no_shift if shift is None else shift
+        given = {"turn": turn, "shift": shift, "gap": GAP + ground, "index": index, "height": self.heights}
+        place = filled(kernels.Placement, **columns, **given)
+        out = (scene.place_position, scene.place_yaw)
+        launch(scene.device, kernels.place_object, scene.world_count, scene.world_mask, self._state, place, *out)
+
+    def put_others(self) -> None:
+        """Put the objects of a set beside object 0 down, about it; capturable."""
+        if not self._beside:
+            return
+        scene, table = self._scene, self._table
+        names = {"turn": "others_turn", "place": "other_place_1", "yaw": "other_yaw_1", "scale": "scale"}
+        columns = {field: table.column(name) for field, name in names.items()}
+        stride = table.column("other_place_2") - columns["place"] if self._beside > 1 else 0
+        clutter = filled(kernels.Clutter, **columns, stride=stride, height=self.heights, gap=GAP)
+        dim, out = (scene.world_count, self._beside), (scene.place_position, scene.place_yaw)
+        launch(scene.device, kernels.place_beside, dim, scene.world_mask, self._state, clutter, *out)

@@ -1,6 +1,6 @@
 """Draw success against environment steps and against time from the tables of the training runs.
 
-Run: ``python -m benchmarks.learning_curves [docs/data] [docs/images/learning_curves.png]``; needs matplotlib. A table
+Run: ``python docs/learning_curves.py [docs/data] [docs/images/learning_curves.png]``; needs matplotlib. A table
 has the columns env_steps, seconds and success of a run's progress.csv; evaluations.csv what the last policy did.
 """
 

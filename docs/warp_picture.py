@@ -5,18 +5,21 @@ one: x = x_k + F_k d (affine), or + 1/2 d^T H_k d with H the second derivatives 
 functions at every splat. Printed is how far splats are from where they should be, and the PSNR of the pictures against
 the one of the exact motion.
 
-Run: ``python -m benchmarks.warp_picture [docs/images/warp.png]``
+Run: ``python docs/warp_picture.py [docs/images/warp.png]``
 """
 
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial import KDTree
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # for the benchmarks
 
 from benchmarks.splat_fidelity import HEIGHT, LENGTH, WIDTH, Motion, Moved, bend, sample_bar
 from softmode.deformables.quadrature.quadrature import quadrature_from_box

@@ -1,0 +1,235 @@
+"""Cut a captured thing into what stands on what, and close the pieces with floors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+
+from softmode.objects.carriers import (
+    LIKELY,
+    SURE,
+    Boundary,
+    Sections,
+    Surface,
+    best_axis,
+    find_boundaries,
+    weighted_median,
+)
+from softmode.splats.components import disc_points, link_labels
+from softmode.splats.splats import Splats
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+PIECES = 4
+"""A thing is cut into at most so many pieces."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Cut:
+    """What lies over a boundary."""
+
+    above: Mask
+    """Which splats of the surface stand on it, shape (N,)."""
+    beneath: Mask
+    """Which lie under it, shape (N,); the rest are frays beside the contact."""
+    floor: Array
+    """Points a cell apart over the contact, shape (M, 3)."""
+
+
+def cut_at(sections: Sections, boundary: Boundary, gap: float) -> Cut:
+    """Cut a surface at a boundary: by a plane through the level splats beside the contact.
+
+    Level splats near the plane go, and so do frays: just above it only what is in the solid that hangs together upwards
+    or over the contact stays. On a rough top splats in the contact stay, too.
+
+    Args:
+        sections: Sections of the surface.
+        boundary: Where.
+        gap: Distance up to which what stands there hangs together.
+    """
+    surface, contact = sections.surface, boundary.contact
+    x, normal, pitch = surface.points, surface.normals, surface.pitch
+    i, j = sections.cells_of(x)
+    height, shift, reach, rough = x[:, 2] - boundary.height, np.zeros(3), 0.5 * sections.layer, False
+    if boundary.kind == "top":
+        span = max((boundary.reach + 1.5) * sections.layer, 0.03 * sections.size)
+        within: Any = ndimage.binary_dilation(contact, iterations=2)
+        outside = ~within[i, j]
+        flat = np.flatnonzero(outside & (np.abs(height) < span) & (np.abs(normal[:, 2]) > 0.8))
+        spread = 0.5 * pitch
+        if len(flat) > 10:
+            shift = _plane(x[flat], height[flat], surface.areas[flat], span, 0.2 * pitch)
+            height = height - x[:, :2] @ shift[:2] - shift[2]
+            near = flat[np.abs(height[flat]) < span]
+            count, edge = np.histogram(height[near], bins=40, weights=surface.areas[near])
+            mode = int(ndimage.gaussian_filter1d(count, 1.5).argmax())
+            top = 0.5 * float(edge[mode] + edge[mode + 1])
+            height, shift[2] = height - top, shift[2] + top
+            spread = weighted_median(np.abs(height[near]), surface.areas[near])
+        reach, rough = float(np.clip(4.0 * spread, 0.3 * pitch, span)), spread > 0.5 * pitch
+    lying = (np.abs(height) <= reach) & (np.abs(normal[:, 2]) > 0.75)
+    if rough:
+        core: Any = ndimage.binary_erosion(contact, iterations=2)
+        lying &= ~(core[i, j] & (height > 0.3 * reach))
+    above = (height > 0.0) & ~lying
+    kept = np.flatnonzero(above)
+    if len(kept) > 50:
+        wide = kept[np.linalg.norm(surface.tangents[kept, :, 1], axis=1) > 0.4 * gap]
+        linked = np.concatenate([x[kept], disc_points(x[wide], surface.tangents[wide], 0.8 * gap)])
+        label = link_labels(linked, 0.8 * gap)[: len(kept)]
+        bulk = np.bincount(label, surface.areas[kept])
+        above[kept] = (bulk >= 0.02 * bulk.max())[label]
+    if boundary.kind == "top":
+        above &= _held(sections, boundary)
+    cells = np.argwhere(contact)
+    plan = (cells + 0.5) * sections.cell + sections.origin[:2]
+    floor = np.column_stack([plan, boundary.height + plan @ shift[:2] + shift[2]])
+    return Cut(above=above, beneath=~above & (height < reach), floor=floor @ sections.basis)
+
+
+def _plane(points: Array, height: Array, areas: Array, span: float, least: float) -> Array:
+    """Return slopes and offset (3,) of the plane of heights over points (N, 3), far ones weighted down."""
+    middle = points[:, :2].mean(axis=0)
+    plan, fit = np.column_stack([points[:, :2] - middle, np.ones(len(points))]), np.zeros(3)
+    weight = areas * np.exp(-((height / span) ** 2))
+    for _ in range(10):
+        off = np.abs(height - plan @ fit)
+        root = np.sqrt(weight) / (1.0 + (off / max(1.5 * weighted_median(off, areas), least)) ** 2)
+        fit = np.linalg.lstsq(plan * root[:, None], height * root, rcond=None)[0]
+    if np.hypot(fit[0], fit[1]) >= 0.1:
+        return np.zeros(3)
+    return np.array([fit[0], fit[1], -float(fit[:2] @ middle)])
+
+
+def _held(sections: Sections, boundary: Boundary) -> Mask:
+    """Return which splats are high above a boundary, over its contact, or in what hangs together upwards from it."""
+    i, j = sections.cells_of(sections.surface.points)
+    first = min(sections.layer_of(boundary.height) + boundary.reach + 2, len(sections.solid) - 1)
+    solid = sections.solid[first : first + 12]
+    piece: Any = ndimage.label(solid)
+    bulk = np.bincount(piece[0].ravel(), minlength=piece[1] + 1)
+    bulk[0] = 0
+    held = ndimage.binary_dilation((bulk >= 0.05 * bulk.sum())[piece[0]], np.ones((3, 3, 3)))
+    low = ndimage.binary_dilation(boundary.contact, iterations=3)[i, j]
+    k = np.floor((sections.surface.points[:, 2] - sections.origin[2]) / sections.layer).astype(int) - first
+    return (k > 6) | low | ((k >= 1) & held[np.clip(k, 0, len(held) - 1), i, j])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Pieces:
+    """A captured thing, cut where one piece of it may stand on another."""
+
+    number: NDArray[np.intp]
+    """Piece of each splat, from the top on from 1, shape (N,); 0 for frays."""
+    cuts: tuple[Cut, ...]
+    """The cuts between the pieces, from the top on."""
+    boundaries: tuple[Boundary, ...]
+    """What is there."""
+    top: int
+    """The pieces from the first to this one are the object, the others carry it."""
+    sections: Sections
+    """The sections of the thing."""
+
+    @property
+    def count(self) -> int:
+        """Number of pieces."""
+        return len(self.cuts) + 1
+
+    def floors(self, taken: set[int], thing: Splats) -> list[Splats]:
+        """Return discs that close pieces where others were taken off them, coloured like the nearest splats."""
+        found = []
+        for k, cut in enumerate(self.cuts, start=1):
+            if (k in taken) == (k + 1 in taken):
+                continue
+            turn = Rotation.align_vectors([self.sections.basis[2]], [[0.0, 0.0, 1.0]])[0].as_quat()
+            edge, count = self.sections.cell, len(cut.floor)
+            near = thing.subset(np.isin(self.number, list(taken)))
+            found.append(
+                Splats(
+                    means=cut.floor,
+                    quats=np.tile(turn, (count, 1)),
+                    scales=np.tile([edge, edge, 0.1 * edge], (count, 1)),
+                    opacities=np.full(count, 0.95),
+                    sh=near.sh[KDTree(near.means).query(cut.floor)[1], :1],
+                    offset=thing.offset,
+                )
+            )
+        return found
+
+    @cached_property
+    def told(self) -> dict[str, str | int | float]:
+        """What a report says of the carrier, and of what may be one or may be none."""
+
+        def option(last: int) -> str:
+            return " ".join(map(str, range(1, last + 1)))
+
+        heights = [float(cut.floor[:, 2].mean()) for cut in self.cuts]
+        scores = [boundary.score for boundary in self.boundaries]
+        told: dict[str, str | int | float] = {}
+        doubts = {k: score for k, score in enumerate(scores, start=1) if k != self.top}
+        if self.top < self.count:
+            score = scores[self.top - 1]
+            told |= {
+                "carrier": self.boundaries[self.top - 1].kind,
+                "carrier_splats": int((self.number > self.top).sum()),
+                "carrier_height": heights[self.top - 1],
+                "carrier_score": score,
+                "carrier_part": option(self.count),
+            }
+            if score > SURE and max(doubts.values(), default=0.0) < LIKELY:
+                return told
+            others = ", ".join(f"z = {heights[k - 1]:.4g} (score {found:.2f})" for k, found in doubts.items())
+            told["doubt"] = f"it was cut off what carries it at z = {heights[self.top - 1]:.4g} (score {score:.2f})"
+            told["doubt"] += f"; it may end elsewhere: {others}" if others else ", which is not sure"
+            doubts[self.count] = 1.0 - score
+        else:
+            k = max(doubts, key=lambda k: doubts[k])
+            told["doubt"] = f"it was kept whole, but may be carried by what is below z = {heights[k - 1]:.4g}"
+            told["doubt"] += f" (score {doubts[k]:.2f})"
+        parts = {
+            k: f"--part {option(k)} takes "
+            + ("all of it" if k == self.count else f"what is above {heights[k - 1]:.4g}")
+            for k in sorted(doubts, key=lambda k: -doubts[k])
+        }
+        told["doubt_remedy"] = "look at it (softmode splat show); " + ", ".join(parts.values())
+        return told
+
+
+def divide(thing: Splats, normal: Array | None, gap: float) -> Pieces | None:
+    """Cut a thing where one piece of it may stand on another; None where nothing does.
+
+    Args:
+        thing: One part of a capture, z up.
+        normal: Normal of the ground that it stands on, shape (3,), None if there is none.
+        gap: Distance up to which splats hang together.
+    """
+    low, high = thing.bounds(quantile=0.01)
+    wide = 0.25 * float(np.linalg.norm(high - low))
+    solid = np.flatnonzero((thing.opacities >= 0.2) & (thing.scales.max(axis=1) < wide))
+    if len(solid) < 500:
+        return None
+    surface = Surface.of(thing.subset(solid))
+    axis = best_axis(surface, np.array([0.0, 0.0, 1.0])) if normal is None else normal
+    sections = Sections(surface, axis)
+    found, chosen = find_boundaries(sections)
+    if not found:
+        return None
+    ranked = sorted(found, key=lambda boundary: -boundary.score - 2.0 * (boundary is chosen))[: PIECES - 1]
+    ranked.sort(key=lambda boundary: -boundary.height)
+    cuts = [cut_at(sections, boundary, gap) for boundary in ranked]
+    number = np.where(cuts[-1].beneath, len(cuts) + 1, 0)
+    for k in range(len(cuts), 0, -1):
+        number[cuts[k - 1].above] = k
+    away, nearest = KDTree(surface.points).query(thing.means)
+    every = np.where(away < 0.5 * gap, number[nearest], 0)
+    every[solid] = number
+    top = len(cuts) + 1 if chosen is None else 1 + next(k for k, found in enumerate(ranked) if found is chosen)
+    return Pieces(number=every, cuts=tuple(cuts), boundaries=tuple(ranked), top=top, sections=sections)

@@ -1,0 +1,114 @@
+"""What a program that takes long is about: after three seconds without a word, and every three from then on."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+KERNELS = "loading kernels"
+"""Stage in which modules are loaded, and compiled where the cache does not hold them."""
+PERIOD = 2.5
+"""Seconds without a word after which it is said what goes on."""
+
+Told = Callable[[str, float], None]
+
+
+class _Watch:
+    """The stages under way in a process, innermost last, and the thread that says which it is."""
+
+    def __init__(self) -> None:
+        """Nothing is under way."""
+        self.stages: list[tuple[str, float]] = []
+        self.listeners: list[Told] = []
+        self.count = 0
+        """Modules that were compiled since this stage began."""
+        self.moved = 0.0
+        self._lock = threading.Lock()
+        self._thread: tuple[int, threading.Thread] | None = None
+
+    def begin(self, name: str) -> None:
+        """Note a stage; the first one starts the thread."""
+        with self._lock:
+            now = time.monotonic()
+            if not self.stages:
+                self.moved = now
+            if name != KERNELS or not self.stages or self.stages[-1][0] != KERNELS:
+                self.count = 0
+            self.stages.append((name, now))
+            if self._thread is None or self._thread[0] != os.getpid() or not self._thread[1].is_alive():
+                thread = threading.Thread(target=self._run, name="stages", daemon=True)
+                self._thread = os.getpid(), thread
+                thread.start()
+
+    def end(self) -> None:
+        """Forget the innermost stage."""
+        with self._lock:
+            self.stages.pop()
+
+    def _run(self) -> None:
+        """Speak where nobody else has for a while, until nothing is under way."""
+        while True:
+            time.sleep(0.2 * PERIOD)
+            with self._lock:
+                if not self.stages:
+                    self._thread = None
+                    return
+                now = time.monotonic()
+                if now - self.moved < PERIOD:
+                    continue
+                self.moved, (name, begun) = now, self.stages[-1]
+                if name == KERNELS and self.count:
+                    name = f"compiling kernels (first run only, {self.count} modules so far)"
+                tell = self.listeners[-1] if self.listeners else _print
+            with contextlib.suppress(OSError, ValueError):  # a stream that is closed
+                tell(name, now - begun)
+
+
+_WATCH = _Watch()
+
+
+@contextlib.contextmanager
+def stage(name: str) -> Iterator[None]:
+    """Say on stderr that `name` goes on, where the block takes longer than three seconds, and again every three.
+
+    Args:
+        name: What goes on, such as "building the body".
+    """
+    _WATCH.begin(name)
+    try:
+        yield
+    finally:
+        _WATCH.end()
+
+
+@contextlib.contextmanager
+def told_to(listener: Told) -> Iterator[None]:
+    """Pass what would be said in a block to a listener: a stage, and for how long it has gone on [s]."""
+    _WATCH.listeners.append(listener)
+    try:
+        yield
+    finally:
+        _WATCH.listeners.remove(listener)
+
+
+def moved() -> None:
+    """Note that something was shown just now, such as a bar."""
+    _WATCH.moved = time.monotonic()
+
+
+def compiled() -> None:
+    """Note that a module was compiled."""
+    _WATCH.count += 1
+
+
+def _print(name: str, seconds: float) -> None:
+    """Write a line, above the bars that there are."""
+    line = f"softmode: {name}, {seconds:.0f} s"
+    if "tqdm" in sys.modules:
+        sys.modules["tqdm"].tqdm.write(line, file=sys.stderr)
+    else:
+        print(line, file=sys.stderr, flush=True)
