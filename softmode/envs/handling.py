@@ -63,7 +63,7 @@ class Handling:
         """Return what an episode goes on from."""
         return {f"handling.{name}": getattr(self, name) for name in kernels.Handling.vars}
 
-    def watch(self, substep: int = 0) -> None:
+    def watch(self, substep: int) -> None:
         """Raise the peaks after a substep."""
         scene, tables = self._scene, self._scene.solver.tables
         fingers = (scene.model.body_world_start, tables.body_wrench, scene.finger_body)

@@ -219,8 +219,9 @@ class Task:
             self.film = TaskFilm(self)
             self.build()
             self.plan = None if self.step_kernels is None else plan_of(self, self.step_kernels[0])
+            watch = partial(self.handling.watch, scene.config.substeps - 1)
             judge = partial(self.judge, self.episodes.never)
-            for launches in (self.before_step, self.handling.watch, judge, self.clear):
+            for launches in (self.before_step, watch, judge, self.clear):
                 compile_launches(launches, self.device)
         self.reset()
         self.graph = capture_graph(self._step, self.device)
