@@ -69,7 +69,7 @@ class Handling:
         fingers = (scene.model.body_world_start, tables.body_wrench, scene.finger_body)
         given = (int(substep == 0), *fingers, self.step_force, self.step_strain)
         launch(scene.device, kernels.watch_forces, scene.world_count, *given)
-        if (scene.config.substeps - 1 - substep) % 2 == 0:
+        if substep % 2 == 1:
             dim = (scene.world_count, scene.occupancy.slots, tables.layout.point_max)
             bodies = (len(scene.objects), tables.instances, tables.basis, tables.arrays.q)
             launch(scene.device, kernels.watch_deformation, dim, *bodies, self.handled, self.step_strain)

@@ -141,6 +141,8 @@ class TableScene:
         self.world_count = world_count
         self.device = wp.get_device(device)
         self.dt = 1.0 / (config.control_hz * config.substeps)
+        self.after_substep: Callable[[int], None] | None = None
+        """Launches after each substep, whose number it is given."""
         given = config.objects
         if given is not None and given.resample and (config.others or config.grip_slots):
             what = "others" if config.others else "grip_slots"
