@@ -68,7 +68,6 @@ class LocalWorlds:
         set_worlds_state(self.task, owner, arrays, mask)
         if begin:
             self.task.episodes.begin(mask)
-            self.task.handling.forget(self.task.scene.world_mask)
 
     def step(self, actions: NDArray[np.float32] | None) -> None:
         """Advance all worlds; None takes the actions that are on the device already."""
