@@ -37,9 +37,7 @@ TOYS = {
     "disc": ObjectConfig(shape="cylinder", extents=(0.08, 0.08, 0.025)),
 }
 FALLING = "large bear,ball,bear,cube,small bear,beam,bear,disc,large bear,ball,small bear,cube,bear".split(",")
-PRESETS = (
-    "bread mug banana fish doughnut ball block-a block-b block-c sponge bear cushion glove".split()
-)  # heavy ones first
+PRESETS = "bread mug banana fish doughnut ball block-a block-b block-c sponge bear cushion glove".split()
 SMALL = {"doughnut": 0.07, "ball": 0.055, "block-a": 0.048, "block-b": 0.048, "block-c": 0.048}
 LAYER = ((0.0, 0.0), (0.06, 0.06), (-0.06, -0.06), (0.06, -0.06), (-0.06, 0.06))
 """Where the five of a layer start [m]."""
