@@ -100,8 +100,8 @@ def _chains(points: NDArray[Any], gap: float) -> tuple[KDTree, NDArray[np.intp]]
 def _disc_points(splats: Splats, gap: float, widest: float) -> NDArray[np.float32]:
     """Return points on the discs of flat splats that are wider than half the gap, and not haze wider than `widest`."""
     thin, wide, long = np.sort(splats.scales, axis=1).T
-    flat = splats.subset((wide > 0.5 * gap) & (thin < 0.3 * wide) & (splats.opacities >= 0.5) & (long < widest))
-    return disc_points(flat.means, flat.discs()[1], gap)
+    flat = (wide > 0.5 * gap) & (thin < 0.3 * wide) & (splats.opacities >= 0.5) & (long < widest)
+    return disc_points(splats.means[flat], splats.discs()[1][flat], gap)
 
 
 def disc_points(means: NDArray[Any], tangents: NDArray[Any], gap: float) -> NDArray[np.float32]:
