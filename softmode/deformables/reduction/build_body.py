@@ -163,8 +163,9 @@ def _build(
     with under_way(f"building the body of {name}"), _reporter(progress, name) as report:
 
         def stage(label: str) -> None:
-            seconds[label] = time.perf_counter() - start - sum(seconds.values())
-            report(label, _PROGRESS[label])
+            # Where two bases are compared, stages come again: their seconds add up, and the bar does not go back.
+            seconds[label] = seconds.get(label, 0.0) + time.perf_counter() - start - sum(seconds.values())
+            report(label, max(_PROGRESS[done] for done in seconds))
 
         basis = make_body_basis(
             Domain(
@@ -368,6 +369,9 @@ def positive_field(name: str, value: Field | None, points: Array) -> Array:
 
 @contextlib.contextmanager
 def _reporter(progress: bool | Progress | None, name: str) -> Iterator[Progress]:
+    if callable(progress):
+        yield progress
+        return
     shown = progress if progress is not None else sys.stderr.isatty()
     if not shown:
         yield lambda stage, fraction: None
