@@ -21,7 +21,7 @@ class Handling:
     """Figures of the episode of every world, kept on the device; `TableScene.after_substep` feeds them.
 
     The force is that of a link or finger on all soft bodies together, so what a finger presses on the table with is no
-    part of it. Forces are looked at after every substep, deformation after every second, of which the last is one: it
+    part of it. Forces are looked at after every substep, deformation after every fourth, of which the last is one: it
     costs more. Strains and energies are those of the objects of the task (`Occupancy.slots`), at cubature points.
 
     Args:
@@ -69,7 +69,7 @@ class Handling:
         fingers = (scene.model.body_world_start, tables.body_wrench, scene.finger_body)
         given = (int(substep == 0), *fingers, self.step_force, self.step_strain)
         launch(scene.device, kernels.watch_forces, scene.world_count, *given)
-        if substep % 2 == 1:
+        if (scene.config.substeps - 1 - substep) % 4 == 0:
             dim = (scene.world_count, scene.occupancy.slots, tables.layout.point_max)
             bodies = (len(scene.objects), tables.instances, tables.basis, tables.arrays.q)
             launch(scene.device, kernels.watch_deformation, dim, *bodies, self.handled, self.step_strain)
