@@ -18,7 +18,7 @@ from softmode.errors import AssetError, ConfigError, SoftmodeError
 from softmode.learning.config_values import split_config
 from softmode.learning.players import trained_policy
 from softmode.mpm.run import is_morph
-from softmode.view.page import open_browser
+from softmode.view.browser import open_browser
 
 if TYPE_CHECKING:
     from softmode.view.app import ViewOptions

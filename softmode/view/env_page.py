@@ -13,8 +13,9 @@ from softmode.scenes.host import host
 from softmode.scenes.meshes import SceneMesh, scene_meshes
 from softmode.splats.splats import SH_DC
 from softmode.view.app import ViewOptions, aim
+from softmode.view.browser import open_browser
 from softmode.view.live_types import SplatPicture
-from softmode.view.page import Page, open_browser
+from softmode.view.page import Page
 from softmode.view.picture import SIX, goal_marker
 from softmode.view.stage import Stage
 

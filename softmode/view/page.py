@@ -4,21 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import io
-import os
-import sys
-import threading
 from typing import Self
 
 from softmode.view.app import ViewOptions, page_url, start_server
-
-
-def open_browser(url: str) -> None:
-    """Open a browser without waiting for it, where there is a display."""
-    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        return
-    import webbrowser
-
-    threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
 
 
 class Page:
