@@ -177,7 +177,7 @@ def find_ground(splats: Splats) -> Ground | None:
     # Cells that hold ten splats of the plane on average; holes between them do not count.
     cell = max(float(np.sqrt(10.0 * np.ptp(plan[flat], axis=0).prod() / flat.sum())), 0.01 * size)
     edges = [np.arange(along.min(), along.max() + cell, cell) for along in plan.T]
-    held, over = (np.histogram2d(*plan[some].T, edges)[0] for some in (flat, rest))
+    held, over = (np.histogram2d(plan[some, 0], plan[some, 1], edges)[0] for some in (flat, rest))
     floor = held >= 2
     if (over[floor] >= 0.25 * held[floor]).mean() >= GROUND_COVER:
         return None

@@ -185,7 +185,7 @@ def _one_jaw(robot: RobotDescription, sides: tuple[list[int], list[int]]) -> tup
     z = _out(robot, closed, points(closed, 0).mean(0) - closed.xanchor[j], axis)
     y = axis if model.jnt_type[j] == _SLIDE else np.cross(axis, z)
     y = y * np.sign((points(poses[5], 0).mean(0) - points(closed, 0).mean(0)) @ y)
-    turn = np.column_stack([np.cross(y, z), y, z])
+    turn: Any = np.column_stack([np.cross(y, z), y, z])
     fixed = points(closed, 1) @ turn
     tip = min(fixed[:, 2].max(), (points(closed, 0) @ turn)[:, 2].max())
     gaps = np.array([_one_gap(robot, data, turn, tip - _JAW) for data in poses])
@@ -240,7 +240,7 @@ def _two_fingers(robot: RobotDescription, sides: tuple[list[int], list[int]]) ->
     if not len(base):
         base = wide.xpos[[model.body_parentid[sides[0][0]]]]
     z = _out(robot, wide, np.concatenate(fingers).mean(0) - base.mean(0), y)
-    turn = np.column_stack([np.cross(y, z), y, z])
+    turn: Any = np.column_stack([np.cross(y, z), y, z])
     left, right = (_pad_corners(model, wide, side, turn[:, 2]) @ turn for side in sides)
     face = np.array([left[:, 1].min(), right[:, 1].max()])
     opening = float(face[0] - face[1])

@@ -70,7 +70,7 @@ def average_basis(functions: Functions, means: ArrayLike, covariances: ArrayLike
     arms = np.maximum(arms, least)
     grid = _Grid(functions, x, arms, axes, small) if len(x) >= MANY and functions.narrow > 0.0 else None
     sources = [(functions, np.ones(len(x), bool))] if grid is None else [(functions, grid.exact), (grid, ~grid.exact)]
-    parts: list[tuple[NDArray[np.intp], Array, Array]] = []
+    parts: list[Any] = []  # rows, values, gradients
     for source, member in sources:
         for rows in filter(len, _portions(np.flatnonzero(member & small))):
             parts.append((rows, *source.evaluate(x[rows])))
