@@ -111,6 +111,9 @@ class ElasticChoice:
     """Largest relative error of the first six frequencies against the whole space, at the worst of the ratios."""
     space_error: float | None
     """By how much the frequencies are higher in the space of the first half of the eigenmodes; None without them."""
+    driven_error: float | None
+    """By how much exact regions are stiffer against each other, in that space or with the functions chosen, whichever
+    is worse; None for fewer than two."""
     space_count: int
     """Dimension of the space."""
     complete_count: int
@@ -123,6 +126,7 @@ class ElasticChoice:
         return {
             "frequency_error": self.frequency_error,
             **({} if self.space_error is None else {"space_error": self.space_error}),
+            **({} if self.driven_error is None else {"driven_error": self.driven_error}),
             "space_functions": float(self.space_count),
             "complete_functions": float(self.complete_count),
             **{
@@ -210,6 +214,7 @@ def choose_functions(
         transform=orthonormal_in_mass(space.transform @ order[:, :chosen], raw, mass),
         frequency_error=error,
         space_error=None if smaller is None else space.frequency_error(smaller, modes),
+        driven_error=space.driven_error([order[:, :chosen], *([] if smaller is None else [smaller])]),
         space_count=space.count + driven,
         complete_count=_complete(shares, chosen) + driven,
         space_eigenvalues=modes,
@@ -288,6 +293,8 @@ class _ElasticSpace:
         """What soft regions add to the stiffness of each component, per E, shape (V, V)."""
         self.held, self.exact = held, held is not None and held.driven.shape[1] > 0
         self.rigid = RIGID if held is None else 0
+        self.answered: tuple[float, Array, Array, Array] | None = None
+        """Poisson's ratio, energy of driven functions, their pull on others, motions of regions of unit energy."""
         self.alone = held is not None and self.exact and not held.motions.shape[1]
         """Whether one exact region holds the body."""
         if held is not None:
@@ -361,6 +368,23 @@ class _ElasticSpace:
             worst = max(worst, float((np.sqrt(found[real] / value[: len(found)][real]) - 1.0).max()))
         return worst
 
+    def driven_error(self, spaces: list[Array]) -> float | None:
+        """Return by how much exact regions are stiffer against each other in the worst of some spaces (V, n), or None.
+
+        Of all their motions it is the worst one: the largest ratio of energies, less one.
+        """
+        if self.answered is None:
+            return None
+        ratio, base, pull, motion = self.answered
+        worst = 1.0
+        for chosen in spaces:
+            part = np.einsum("ak,iajb,bl->ikjl", chosen, self.free, chosen, optimize=True)
+            stiffness = elastic_stiffness(part, ratio) + np.kron(np.eye(3), chosen.T @ self.springs @ chosen)
+            load = np.einsum("ak,iam->ikm", chosen, pull.reshape(3, self.count, -1)).reshape(len(stiffness), -1)
+            energy = base - load.T @ linalg.solve(stiffness, load, assume_a="pos", check_finite=False)
+            worst = max(worst, float(np.linalg.eigvalsh(motion.T @ energy @ motion)[-1]))
+        return worst - 1.0
+
     def _stiffness(self, poissons_ratio: float) -> Array:
         """Return the stiffness of the free functions with the springs of soft regions, (3 V, 3 V)."""
         return elastic_stiffness(self.free, poissons_ratio) + np.kron(np.eye(3), self.springs)
@@ -409,9 +433,11 @@ class _ElasticSpace:
             free.reshape(3, -1)[:, : self.count] = True
             pull = whole[np.ix_(free, ~free)] @ held.motions
             answer = -linalg.cho_solve(factor, pull)
-            energy = held.motions.T @ whole[np.ix_(~free, ~free)] @ held.motions + pull.T @ answer
-            value, vector = linalg.eigh(energy, held.motions.T @ held.motions + answer.T @ answer)
-            more.append(answer @ (vector[:, RIGID:] / np.sqrt(value[RIGID:])))
+            base = held.motions.T @ whole[np.ix_(~free, ~free)] @ held.motions
+            value, vector = linalg.eigh(base + pull.T @ answer, held.motions.T @ held.motions + answer.T @ answer)
+            motion = vector[:, RIGID:] / np.sqrt(value[RIGID:])
+            self.answered = poissons_ratio, base, pull, motion
+            more.append(answer @ motion)
         return first, np.concatenate(more, axis=1)
 
     def _extend(self, found: Array, block: Array, count: int) -> tuple[Array, Array]:
