@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -243,12 +244,17 @@ def test_regions_follow_affine_motions_exactly(body: ReducedBody) -> None:
 def test_regions_resist_each_other_as_finite_elements_say(gap: float, expected: tuple[float, float]) -> None:
     """Stiffness per E [m] along and across a bar of 20 x 20 mm between two clamps: 6 quadratic elements across.
 
-    At 120 mm Timoshenko's beam has 8.53e-5 across. 4,000 points are worth 5 %, between near clamps 7 %.
+    At 120 mm Timoshenko's beam has 8.53e-5 across. 4,000 points are worth 5 %, between near clamps 7 %, where the build
+    says that its functions are too stiff.
     """
     quadrature = quadrature_from_box((gap + 0.04, 0.02, 0.02), point_count=4000, surface_count=60)
     ends = ((-INF, -INF, -INF), (-0.5 * gap, INF, INF)), ((0.5 * gap, -INF, -INF), (INF, INF, INF))
     regions = [Region(name=name, box=box) for name, box in zip("ab", ends, strict=True)]
-    body = build_body(quadrature, BuildOptions(poissons_ratio=0.3), regions=regions, progress=False)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        body = build_body(quadrature, BuildOptions(poissons_ratio=0.3), regions=regions, progress=False)
+    told = any("driven_error" in str(warning.message) for warning in caught)
+    assert told == (float(str(body.provenance["driven_error"])) > 0.05) == (gap < 0.1)
     n, r = body.function_count, body.driven_count
     driven = np.zeros((2, 3, n))
     for axis, motion in zip((0, 2), driven, strict=True):
@@ -258,7 +264,6 @@ def test_regions_resist_each_other_as_finite_elements_say(gap: float, expected: 
     answer = -np.linalg.solve(K[np.ix_(free, free)], K[free] @ motions.T)
     found = np.diag(motions @ K @ motions.T + motions @ K[:, free] @ answer)
     np.testing.assert_allclose(found, expected, rtol=0.05 if gap > 0.1 else 0.07)
-    assert 0.0 <= float(str(body.provenance["driven_error"])) < 0.1
 
 
 def test_drive_is_least_squares(body: ReducedBody) -> None:
