@@ -60,7 +60,7 @@ KERNEL_MODES = 12
 KERNEL_EDGE = 1.3
 """Kernels of held bodies are no narrower than so many of the longest edges of octants: with 6 mm on octants of 6 mm a
 plate gave way in its plane 4 % too far, between the points."""
-KERNEL_POINTS, MODE_POINTS = 3, 36
+KERNEL_POINTS, MODE_POINTS = 3, 32
 """Free quadrature points for each kernel that acts among them, and for each quadratic eigenmode, where exact regions
 hold the rest: with fewer, displacements hide between points. Ten millimetres between two clamps were half as stiff."""
 LIP_COUNT = 20

@@ -20,7 +20,7 @@ radian, where one exact region holds the body the first modes and the responses 
 the constraint modes of exact regions that move against each other (Craig and Bampton 1968,
 doi:10.2514/3.4741). Weights are w = min(1, omega_1 / omega): a turn between two clamps is far from what linear modes
 say, and wants higher ones. With omega^2 a beam that is twisted by 720 degrees has ten times the error. Such a turn also
-wants products of slow functions with affine motion, which are targets too; the first modes then weigh as much as these.
+wants products of slow functions with affine motion, which are targets too; the first modes weigh more than these.
 
 The functions of a smaller count are the first of a larger one, so that more functions never make a body stiffer. The
 choice is the one of modal substructuring with all components taken apart (von Tycowicz et al. 2013,
@@ -65,17 +65,18 @@ EQUAL = 0.95
 of a star differ by 4 % at most within a cluster and by 6 % and more between two."""
 TURN_COUNT, TURN_LEVEL = 6, 3.0
 """Where exact regions move against each other, targets are also the first so many eigenmodes times affine motion, those
-of the first so many times unit energy. A twist by theta(x) is cos theta y and sin theta z, of which linear modes hold
-the first order: a beam turned by 720 degrees has three times the error without them."""
-TURN_MODES = 5
-"""So many elastic modes then weigh as many times more, or a plate held at two edges has its fourth 10 % too high."""
+of the first, as constraint modes, so many times unit energy. A twist by theta(x) is cos theta y and sin theta z, of
+which linear modes hold the first order: a beam turned by 720 degrees has three times the error without them."""
 AMPLITUDE = 0.25
 """Half the angle [rad] through which a body turns where static responses of first and second order weigh alike."""
 BLOCK, BLOCK_STEPS = 16, 12
 """Vectors in a block of Lanczos, and the least number of blocks."""
-FEW_TARGETS, FIRST_MODES, FIRST_LEVEL = 12, 6, 4.0
-"""Elastic modes among the targets of a body with one exact region; the first so many weigh so many times more. With 40
-of them a hollow box has its third frequency 8.5 %, a plate its sixth 20 % too high."""
+FIRST_MODES, FIRST_LEVEL = 6, 4.0
+"""The first so many elastic modes weigh so many times more where exact regions hold the body: a plate of nu = 0.49 that
+is held at two edges had its sixth frequency 2.3 times too high when five weighed three times more."""
+FEW_TARGETS = 12
+"""Elastic modes among the targets of a body with one exact region. With 40 of them a hollow box has its third frequency
+8.5 %, a plate its sixth 20 % too high."""
 LOAD_COUNT, LOAD_LEVEL = 20, 2.0
 """Such a body has the responses to loads along each axis that are as slow as its first so many scalar eigenmodes among
 the targets, the softest of each axis of so many times unit energy: without them loads at its end move a fork by 0.90,
@@ -327,11 +328,10 @@ class _ElasticSpace:
             share = np.minimum(1.0, first / np.maximum(value, floor))
             if self.held is not None:
                 share = np.sqrt(share)  # What regions drive far from rest wants higher modes.
-                if self.turned.shape[1]:
-                    share[:TURN_MODES] *= TURN_LEVEL
+            if self.exact:
+                share[:FIRST_MODES] *= FIRST_LEVEL
             if self.alone:
                 target, value, share = target[:, :FEW_TARGETS], value[:FEW_TARGETS], share[:FEW_TARGETS]
-                share[:FIRST_MODES] *= FIRST_LEVEL
             targets.append(target * (share / np.sqrt(np.maximum(value, floor))))
         blocks = []
         if self.held is not None:
@@ -428,7 +428,7 @@ class _ElasticSpace:
                 answer = linalg.cho_solve(factor, along)
                 more.append(answer * (LOAD_LEVEL / np.sqrt(np.linalg.eigvalsh(along.T @ answer)[-1])))
         if held.motions.shape[1]:
-            # Constraint modes: the body's answer to rigid motions of its exact regions, as Ritz modes of unit energy.
+            # Constraint modes: the body's answer to rigid motions of its exact regions, as Ritz modes.
             whole, free = elastic_stiffness(self.products, poissons_ratio), np.zeros(3 * self.products.shape[1], bool)
             free.reshape(3, -1)[:, : self.count] = True
             pull = whole[np.ix_(free, ~free)] @ held.motions
@@ -437,7 +437,7 @@ class _ElasticSpace:
             value, vector = linalg.eigh(base + pull.T @ answer, held.motions.T @ held.motions + answer.T @ answer)
             motion = vector[:, RIGID:] / np.sqrt(value[RIGID:])
             self.answered = poissons_ratio, base, pull, motion
-            more.append(answer @ motion)
+            more.append(TURN_LEVEL * answer @ motion)
         return first, np.concatenate(more, axis=1)
 
     def _extend(self, found: Array, block: Array, count: int) -> tuple[Array, Array]:
