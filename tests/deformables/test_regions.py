@@ -92,7 +92,7 @@ def affine_motion(body: ReducedBody, rng: np.random.Generator) -> tuple[np.ndarr
 def test_bodies_of_files_before_keep_their_functions() -> None:
     """A body of version 3, whose envelope was as wide as the body, has the functions that it was built with."""
     body, beside = ReducedBody.load_with(Path(__file__).with_name("held_version_3.npz"))
-    assert body.envelope_length == 0.0
+    assert body.envelope_length == 0.0 and not body.gap_blends
     value, gradient = body.evaluate(beside["check.points"])
     np.testing.assert_allclose(value, beside["check.values"], atol=1e-12 * np.abs(value).max())
     np.testing.assert_allclose(gradient, beside["check.gradients"], atol=1e-6 * np.abs(gradient).max())
@@ -115,11 +115,11 @@ def test_distance_is_one_lipschitz_and_its_gradient_is_right(region: Region) -> 
     assert np.abs(region.distance(face)[0]).max() < 1e-12
 
 
-@pytest.mark.parametrize("wide", [False, True], ids=["narrow", "of version 3"])
-def test_envelope_vanishes_on_regions_and_blends_are_a_partition(wide: bool) -> None:
+@pytest.mark.parametrize(("wide", "gap"), [(False, True), (True, False), (False, False)], ids=["new", "3", "4"])
+def test_envelope_vanishes_on_regions_and_blends_are_a_partition(wide: bool, gap: bool) -> None:
     """G = 0 on every region and > 0 elsewhere; sum T_i = 1, T_i = 1 on region i; gradients by finite differences."""
     rng = np.random.default_rng(1)
-    envelope = Envelope((LEFT, RIGHT, Region(name="top", points=[[0.0, 0.0, 0.3]], radius=0.05)), 0.1, wide)
+    envelope = Envelope((LEFT, RIGHT, Region(name="top", points=[[0.0, 0.0, 0.3]], radius=0.05)), 0.1, wide, gap)
     x = rng.uniform(-0.3, 0.3, size=(400, 3))
     value, gradient, blend, blend_gradient = envelope.evaluate(x)
     outside = np.min([region.distance(x)[0] for region in envelope.regions], axis=0) > 0.0

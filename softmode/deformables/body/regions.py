@@ -169,6 +169,8 @@ class Envelope:
     """Distance w at which the envelope is one [m]."""
     wide: bool = False
     """Whether it is g = d / (d + length) instead, that of bodies in files of version 3 and before."""
+    gap: bool = True
+    """Whether blends change over the whole gap; else with the envelope, those of files of version 4 and before."""
 
     def holds(self, points: Array) -> NDArray[np.bool_]:
         """Return which points (N, 3) lie in a region, its face included."""
@@ -182,7 +184,7 @@ class Envelope:
 
         Returns:
             G = prod_i g_i with g_i = 1 - (1 - min(d_i / w, 1))^3, zero on every region, (N,), its gradient (N, 3);
-            T_i = (1 / s_i) / sum_j (1 / s_j) with s_i = d_i^2, one on region i and zero on the others, (N, R), its
+            T_i = (1 / s_i) / sum_j (1 / s_j), s_i = d_i^2 or g_i, one on region i and zero on the others, (N, R), its
             gradient (N, R, 3).
         """
         count = len(self.regions)
@@ -192,16 +194,16 @@ class Envelope:
             distance, normal = region.distance(points)
             distance, normal = np.maximum(distance, 0.0) / self.length, normal * (distance > 0.0)[:, None] / self.length
             if self.wide:
-                g[:, i] = s[:, i] = distance / (distance + 1.0)
-                slope[:, i] = rise[:, i] = normal / ((distance + 1.0) ** 2)[:, None]
+                g[:, i], slope[:, i] = distance / (distance + 1.0), normal / ((distance + 1.0) ** 2)[:, None]
             else:
                 rest = 1.0 - np.minimum(distance, 1.0)
                 g[:, i], slope[:, i] = 1.0 - rest**3, normal * (3.0 * rest**2)[:, None]
-                s[:, i], rise[:, i] = distance**2, normal * (2.0 * distance)[:, None]
+            s[:, i], rise[:, i] = distance**2, normal * (2.0 * distance)[:, None]
         others, others_slope = _without_one(g, slope)
         whole, whole_slope = g[:, 0] * others[:, 0], g[:, 0, None] * others_slope[:, 0]
         whole_slope = whole_slope + slope[:, 0] * others[:, 0, None]
-        others, others_slope = _without_one(s, rise)
+        if self.gap and not self.wide:
+            others, others_slope = _without_one(s, rise)
         total = np.maximum(others.sum(axis=1), 1e-300)
         blend = others / total[:, None]
         blend_slope = (others_slope - blend[:, :, None] * others_slope.sum(axis=1)[:, None]) / total[:, None, None]
