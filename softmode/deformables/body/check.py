@@ -16,6 +16,7 @@ _KINDS = {
     "kernel": str,
     "length": float,
     "envelope_length": float,
+    "gap_blends": bool,
     "driven_count": int,
     "region_names": tuple,
     "fingerprint": str,

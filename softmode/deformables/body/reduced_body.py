@@ -38,11 +38,11 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Scalar = str | int | float | bool | None
 
-FORMAT, FORMAT_VERSION = "softmode.ReducedBody", 4
+FORMAT, FORMAT_VERSION = "softmode.ReducedBody", 5
 """Kind and version of a body's file."""
-READABLE = (2, 3, 4)
-"""Versions that are read. Bodies of version 2 have no detours, those before 4 a wide envelope; all keep the functions
-that they had."""
+READABLE = (2, 3, 4, 5)
+"""Versions that are read. Bodies of version 2 have no detours, those of 2 and 3 a wide envelope, those before 5 blends
+that change beside the faces; all keep the functions that they had."""
 _HINT = "build the body again"
 RATIO_HARMLESS = 0.45
 """Poisson's ratio up to which functions made for any other serve."""
@@ -134,7 +134,9 @@ class ReducedBody:
     """Wall time of the build [s]."""
     envelope_length: float = 0.0
     """Distance from exact regions at which the envelope of the functions is one [m]; 0 without such regions, and in
-    files before version 4, whose envelope is d / (d + `length`)."""
+    files of versions 2 and 3, whose envelope is d / (d + `length`)."""
+    gap_blends: bool = True
+    """Whether blends between exact regions change over the whole gap; in files before version 5 they do not."""
     material_points: Array = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
     """Points of the material [m], shape (N, 3); empty where every kernel acts on all within its support."""
     hidden_pairs: Indices = dataclasses.field(default_factory=lambda: np.zeros(0, dtype=np.int64))
@@ -202,7 +204,9 @@ class ReducedBody:
     @cached_property
     def _envelope(self) -> Envelope | None:
         exact = tuple(region for region in self.regions if region.stiffness is None)
-        return Envelope(exact, self.envelope_length or self.length, not self.envelope_length) if exact else None
+        if not exact:
+            return None
+        return Envelope(exact, self.envelope_length or self.length, not self.envelope_length, self.gap_blends)
 
     @cached_property
     def kernels(self) -> BasisRKPM:
@@ -467,7 +471,7 @@ class ReducedBody:
         Raises:
             AssetError: If they are not those of a body.
         """
-        header = {"envelope_length": 0.0, **header}
+        header = {"envelope_length": 0.0, "gap_blends": False, **header}
         names = {f.name for f in _own_fields()}
         for table in _TABLES.values():
             if not arrays.keys() & (table - {"material_points"}):

@@ -6,6 +6,9 @@ leaves the region's face with a kink, as the displacement of a clamped body does
 and Sheiko 1995, doi:10.1115/1.3005099). No kernel of finite width can do either. w is one radius of the kernels: beyond
 it they reproduce linear fields as on a free body. An envelope as wide as the body takes that from them everywhere, and
 a spiral strip was three times too stiff with it.
+
+Blends between regions change over the whole gap instead. Within w kernels are as narrow as what they would have to
+cancel: two clamps whose blend rose there were three times too stiff when they moved across against each other.
 """
 
 from __future__ import annotations
@@ -166,6 +169,8 @@ class Envelope:
     """Distance w at which the envelope is one [m]."""
     wide: bool = False
     """Whether it is g = d / (d + length) instead, that of bodies in files of version 3 and before."""
+    gap: bool = True
+    """Whether blends change over the whole gap; else with the envelope, those of files of version 4 and before."""
 
     def holds(self, points: Array) -> NDArray[np.bool_]:
         """Return which points (N, 3) lie in a region, its face included."""
@@ -179,30 +184,38 @@ class Envelope:
 
         Returns:
             G = prod_i g_i with g_i = 1 - (1 - min(d_i / w, 1))^3, zero on every region, (N,), its gradient (N, 3);
-            T_i = (1 / g_i) / sum_j (1 / g_j), one on region i and zero on the others, (N, R), its gradient (N, R, 3).
+            T_i = (1 / s_i) / sum_j (1 / s_j), s_i = d_i^2 or g_i, one on region i and zero on the others, (N, R), its
+            gradient (N, R, 3).
         """
         count = len(self.regions)
         g, slope = np.empty((len(points), count)), np.empty((len(points), count, 3))
+        s, rise = np.empty_like(g), np.empty_like(slope)
         for i, region in enumerate(self.regions):
             distance, normal = region.distance(points)
-            distance = np.maximum(distance, 0.0)
+            distance, normal = np.maximum(distance, 0.0) / self.length, normal * (distance > 0.0)[:, None] / self.length
             if self.wide:
-                g[:, i] = distance / (distance + self.length)
-                steep = self.length / (distance + self.length) ** 2
+                g[:, i], slope[:, i] = distance / (distance + 1.0), normal / ((distance + 1.0) ** 2)[:, None]
             else:
-                rest = 1.0 - np.minimum(distance / self.length, 1.0)
-                g[:, i], steep = 1.0 - rest**3, 3.0 * rest**2 / self.length
-            slope[:, i] = normal * np.where(distance > 0.0, steep, 0.0)[:, None]
-        # Products without factor i, and their gradients, free of divisions by a vanishing g.
-        others, others_slope = np.ones_like(g), np.zeros_like(slope)
-        for i in range(count):
-            for l in range(count):
-                if l != i:
-                    others_slope[:, i] = others_slope[:, i] * g[:, l, None] + others[:, i, None] * slope[:, l]
-                    others[:, i] *= g[:, l]
+                rest = 1.0 - np.minimum(distance, 1.0)
+                g[:, i], slope[:, i] = 1.0 - rest**3, normal * (3.0 * rest**2)[:, None]
+            s[:, i], rise[:, i] = distance**2, normal * (2.0 * distance)[:, None]
+        others, others_slope = _without_one(g, slope)
         whole, whole_slope = g[:, 0] * others[:, 0], g[:, 0, None] * others_slope[:, 0]
         whole_slope = whole_slope + slope[:, 0] * others[:, 0, None]
+        if self.gap and not self.wide:
+            others, others_slope = _without_one(s, rise)
         total = np.maximum(others.sum(axis=1), 1e-300)
         blend = others / total[:, None]
         blend_slope = (others_slope - blend[:, :, None] * others_slope.sum(axis=1)[:, None]) / total[:, None, None]
         return whole, whole_slope, blend, blend_slope
+
+
+def _without_one(value: Array, slope: Array) -> tuple[Array, Array]:
+    """Return products of values (N, R) without factor i, and their gradients, free of divisions by what vanishes."""
+    others, others_slope = np.ones_like(value), np.zeros_like(slope)
+    for i in range(value.shape[1]):
+        for l in range(value.shape[1]):
+            if l != i:
+                others_slope[:, i] = others_slope[:, i] * value[:, l, None] + others[:, i, None] * slope[:, l]
+                others[:, i] *= value[:, l]
+    return others, others_slope

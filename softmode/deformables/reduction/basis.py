@@ -60,6 +60,9 @@ KERNEL_MODES = 12
 KERNEL_EDGE = 1.3
 """Kernels of held bodies are no narrower than so many of the longest edges of octants: with 6 mm on octants of 6 mm a
 plate gave way in its plane 4 % too far, between the points."""
+KERNEL_POINTS, MODE_POINTS = 3, 32
+"""Free quadrature points for each kernel that acts among them, and for each quadratic eigenmode, where exact regions
+hold the rest: with fewer, displacements hide between points. Ten millimetres between two clamps were half as stiff."""
 LIP_COUNT = 20
 """Handles along the lips of slits, among the space that functions are chosen from. Eigenmodes resolve a slit slowly:
 48, 64, 96 and 128 of them each lower the first frequency of a slit plush, by 2 to 3 %."""
@@ -157,7 +160,7 @@ def make_body_basis(
         modes = _modes(ground, domain, options, options.mode_count or EIGENMODE_COUNT)
         return _basis(ground, domain, options, modes, stage)
     counts = (QUICK_SLIT_MODES, QUICK_SLIT_MODES) if quick and len(domain.lips) else SPACE_MODE_COUNTS
-    small, large = (min(count, ground.shape.centre_count - 1) for count in counts)
+    small, large = (min(count, ground.most_modes) for count in counts)
     alone = ground.envelope is not None and len(domain.regions) == 1 and large > small > ALONE_QUADRATIC
     modes = _modes(ground, domain, options, large if alone else small)
     basis = _basis(ground, domain, options, modes, stage, quadratic=ALONE_QUADRATIC if alone else None)
@@ -182,16 +185,28 @@ class _Ground:
     springs: Array | None
     """What soft regions add to the stiffness of the kernels, per E [m], (K, K)."""
     region_weights: Array
+    most_modes: int
+    """How many eigenmodes kernels and points have room for."""
 
 
 def _ground(domain: Domain, options: BuildOptions) -> _Ground:
     """Return the kernels of a domain and the weights of its regions."""
-    count = options.kernels(len(domain.seeds))
-    kernels = make_basis(domain.seeds, count, kernel=options.kernel, spacing=domain.spacing, seed=options.seed)
-    few = KERNEL_LEAST if domain.regions and options.kernel_count is None else count
-    while count > few and np.median(kernels.radii) < KERNEL_EDGE * domain.edge:
+    count, exact = options.kernels(len(domain.seeds)), [r for r in domain.regions if r.stiffness is None]
+    free = int(np.all([region.distance(domain.seeds)[0] > 0.0 for region in exact], axis=0).sum()) if exact else None
+
+    def place() -> tuple[BasisRKPM, bool]:
+        """Return the kernels, and whether there are too many for the points."""
+        found = make_basis(domain.seeds, count, kernel=options.kernel, spacing=domain.spacing, seed=options.seed)
+        many = np.median(found.radii) < KERNEL_EDGE * domain.edge
+        if free is not None and not many:
+            reach = [region.distance(found.centres)[0] + found.support for region in exact]
+            many = KERNEL_POINTS * np.all(np.array(reach) > 0.0, axis=0).sum() > free
+        return found, bool(many)
+
+    kernels, many = place()
+    while many and domain.regions and options.kernel_count is None and count > KERNEL_LEAST:
         count = max(count * 4 // 5, KERNEL_LEAST)
-        kernels = make_basis(domain.seeds, count, kernel=options.kernel, spacing=domain.spacing, seed=options.seed)
+        kernels, many = place()
     if domain.material is not None:
         kernels = divide_at_gaps(kernels, domain.material, domain.seeds, domain.spacing, domain.octants)
     envelope = domain.envelope(kernels)
@@ -212,6 +227,7 @@ def _ground(domain: Domain, options: BuildOptions) -> _Ground:
         region_weights=_region_weights(
             domain, shape, blend_slope, *(None if x is None else scalar * x for x in (springs, pull))
         ),
+        most_modes=min([shape.centre_count - 1, *([] if free is None else [max(free // MODE_POINTS, 3 * TURN_COUNT)])]),
     )
 
 
@@ -478,11 +494,13 @@ def _region_weights(
 ) -> Array:
     """Return coefficients of the weights of all regions but the last, exact ones first, (K, R - 1).
 
-    The weights of all regions sum to one: beside the constant handle the last one adds nothing.
+    The weights of all regions sum to one: beside the constant handle the last one adds nothing. Where all are exact
+    they are the blends as they are: eigenmodes cannot cancel what kernels would add, and edges of a plate 40:1 were 1.4
+    times too stiff when one moved out of its plane.
     """
     count = len(domain.regions) - 1
-    if count < 1:
-        return np.zeros((shape.centre_count, 0))
+    if count < 1 or springs is None or pull is None:
+        return np.zeros((shape.centre_count, max(count, 0)))
     gradient = np.zeros((len(domain.points), count, 3))
     exact = min(blend_slope.shape[1], count)
     gradient[:, :exact] = blend_slope[:, :exact]
@@ -492,7 +510,7 @@ def _region_weights(
         blend_gradient=gradient,
         stiffness_scale=domain.stiffness,
         springs=springs,
-        spring_load=None if pull is None else pull[:, :count],
+        spring_load=pull[:, :count],
     )
 
 

@@ -265,13 +265,22 @@ def _warn_of_stiffness(name: str, basis: BodyBasis, options: BuildOptions) -> No
     """Say what makes a body too stiff.
 
     Warns:
-        RuntimeWarning: If its kernels do not resolve it, or its Poisson's ratio wants more functions.
+        RuntimeWarning: If its kernels do not resolve it, or motions of its regions, or its Poisson's ratio wants more
+            functions.
     """
     space, ratio = basis.report.get("space_error", 0.0), max(options.poissons_ratios)
     if space > SPACE_WARNING:
         warnings.warn(
             f"body {name!r}: space_error {100.0 * space:.0f} %: its first six frequencies may be that much too high, by"
             " corners, branches or thin walls that its kernels do not resolve; build it with twice the points",
+            RuntimeWarning,
+            stacklevel=4,
+        )
+    driven = basis.report.get("driven_error", 0.0)
+    if driven > SPACE_WARNING:
+        warnings.warn(
+            f"body {name!r}: driven_error {100.0 * driven:.0f} %: its regions may resist each other's motion that much"
+            " too stiffly; build it with twice the points, or with more functions",
             RuntimeWarning,
             stacklevel=4,
         )

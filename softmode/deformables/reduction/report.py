@@ -273,6 +273,14 @@ def _check_geometry(body: ReducedBody, notes: _Notes) -> None:
             f" {100.0 * space:.0f} % too high, whatever the number of functions",
             "build it with twice the points (--points): more points allow narrower kernels",
         )
+    driven = body.provenance.get("driven_error")
+    if driven is not None and notes.measure("excess of stiffness between regions", float(driven)) > SPACE_WARNING:
+        notes.find(
+            "warning",
+            "regions",
+            f"its regions may resist each other's motion {100.0 * float(driven):.0f} % too much",
+            "build it with twice the points (--points), or more --functions",
+        )
     complete = body.provenance.get("complete_functions")
     if isinstance(complete, float) and complete > body.function_count + 1:  # A pair may be near each other by chance.
         notes.find(

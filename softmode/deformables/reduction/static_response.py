@@ -155,12 +155,12 @@ def solve_harmonic_weights(
     *,
     blend_gradient: Array,
     stiffness_scale: Array,
-    springs: Array | None = None,
-    spring_load: Array | None = None,
+    springs: Array,
+    spring_load: Array,
 ) -> Array:
     """Find the weights of regions: one on a region, zero on the others, of least gradient energy between.
 
-    They are the constraint modes of the regions. The weight is T + sum_k c_k phi_k with T the blend of an exact
+    They serve a body with a soft region. The weight is T + sum_k c_k phi_k with T the blend of an exact
     region, on all of which the kernels vanish, and T = 0 for a soft one, whose springs pull W to one.
 
     Args:
@@ -178,11 +178,7 @@ def solve_harmonic_weights(
     stiff = weights * stiffness_scale
     _, energy = mass_and_gradient_matrix(shape, weights, stiff)
     load = -np.sum([g.T @ (stiff[:, None] * blend_gradient[:, :, d]) for d, g in enumerate(shape.gradient)], axis=0)
-    if springs is not None:
-        energy += springs
-    if spring_load is not None:
-        load = load + spring_load
-    return _factor(energy)(load)
+    return _factor(energy + springs)(load + spring_load)
 
 
 def _factor(matrix: Array) -> Callable[[Array], Array]:
