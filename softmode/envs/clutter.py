@@ -93,7 +93,7 @@ def clutter_parameters(
         ConfigError: If so many do not fit on the table.
     """
     scale = (config.scale_range or (1.0, 1.0))[1]
-    radius = scale * max(float(np.linalg.norm(one.body.surface_points[:, :2], axis=1).max()) for one in members)
+    radius = scale * max(float(np.linalg.norm(one.body.surface.points[:, :2], axis=1).max()) for one in members)
     spread = 0.5 * config.others_clearance
     places = ring_places(count, 2.0 * radius + config.others_clearance, spread, arcs)
     _check_table(config, places, radius, spread, arcs)

@@ -177,7 +177,7 @@ class Task:
         self.table = ParameterTable(self.parameters(), world_count, self.device, kinds=kept, kind=self.scene.member)
         self._rows: list[tuple[wp.array, wp.array, bool]] = []
         members = self.scene.members
-        points = [sample_farthest(thing.body.surface_points, self.point_count, first=0) for thing in members]
+        points = [sample_farthest(thing.body.surface.points, self.point_count, first=0) for thing in members]
         self._points: NDArray[np.intp] = np.stack(points)
         self.points = self.points_of_worlds[0]
         """Those of world 0, and of all worlds that have the same object."""

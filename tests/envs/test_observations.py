@@ -58,7 +58,7 @@ class HostState:
         self.q = q[spans[0]]
         self.centres = np.array([body.mean_basis @ q[span] for body, span in zip(bodies, spans, strict=True)])
         self.velocity = bodies[0].mean_basis @ qd[spans[0]]
-        self.rest = bodies[0].surface_points[env.task.points]
+        self.rest = bodies[0].surface.points[env.task.points]
         dents = self.dents()[env.task.points]
         self.dented = float(np.abs(dents).max())
         self.points = self.deformed(self.rest) + dents
@@ -80,14 +80,14 @@ class HostState:
         body, view, data = self.scene.soft.body, self.scene.solver.view, self.scene.model.softmode
         young, ratio, scale = (float(getattr(data, name).numpy()[0]) for name in MATERIAL)
         size = (body.volume / (body.function_count - body.driven_count)) ** (1.0 / 3.0)
-        free = np.abs(body.surface_basis[:, body.driven_count :]).max(axis=1) > 1.0e-6  # the clamped foot has none
+        free = np.abs(body.surface.basis[:, body.driven_count :]).max(axis=1) > 1.0e-6  # the clamped foot has none
         w = 0.3 * scale * np.minimum(size, 0.6 * thickness(body)) * (1.0 - ratio**2) / young * free
         c = view.constraints
         assert not c.pair_count.numpy()[0]
         held = slice(int(view.instances.pin_count.numpy()[0]), int(c.count.numpy()[0]))
         sample = c.row.numpy()[0, held] - int(view.instances.row_start.numpy()[0])
         normal, moved = c.normal.numpy()[0, held], c.offset.numpy()[0, held] + c.displacement.numpy()[0, held]
-        softer = c.stiffness.numpy()[0, held] * w[sample] / (scale**2 * body.surface_areas[sample])
+        softer = c.stiffness.numpy()[0, held] * w[sample] / (scale**2 * body.surface.areas[sample])
         penetration = -np.einsum("ek,ek->e", normal, moved)
         depth = reference.dent(penetration, float(view.instances.smoothing.numpy()[0]), softer)
         out = np.zeros((body.surface_count, 3))
@@ -132,7 +132,7 @@ def push_soft(seen: HostState) -> Numbers:
     heading = np.sum(np.conj(wanted) * (found[:, 0] + 1j * found[:, 1]))
     heading /= np.abs(heading)
     way = goal - centre[:2]
-    surface = seen.scene.soft.body.surface_points
+    surface = seen.scene.soft.body.surface.points
     back = seen.drawn["scale"][0] * (np.hypot(*surface[:, :2].T).max() + 0.5 * seen.arm.gripper.pad_size[0])
     behind = centre[:2] - back * way / np.linalg.norm(way)
     height = seen.env.config.scene.control.workspace_lower[2] + 0.006

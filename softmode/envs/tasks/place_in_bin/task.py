@@ -195,8 +195,8 @@ class PlaceInBin(Task):
         """Half of its inner edges [m]."""
         self.highest = given.height + self.config.rim_allowance
         """Height of its centre below which an object is in the bin [m]."""
-        toys = [thing.body.surface_points for thing in self.scene.members]
-        others = [thing.body.surface_points for thing in self.scene.objects[self.slots :]]
+        toys = [thing.body.surface.points for thing in self.scene.members]
+        others = [thing.body.surface.points for thing in self.scene.objects[self.slots :]]
         self.wall, self.floor, self.margin, self.clearance = given.wall, given.floor, 0.3 * min(self.half), CLEARANCE
         radius = [[thing.radius] * self.slots for thing in self.scene.members]
         self.radius = self.per_object(radius, every_slot=self.slots > 1)

@@ -138,7 +138,7 @@ class PressSoft(Task):
     @property
     def _tops(self) -> NDArray[np.float64]:
         """Height of every unscaled pad that a world may have [m], shape (members,)."""
-        return np.array([float(np.ptp(thing.body.surface_points[:, 2])) for thing in self.scene.members])
+        return np.array([float(np.ptp(thing.body.surface.points[:, 2])) for thing in self.scene.members])
 
     @property
     def tops(self) -> NDArray[np.float64]:
