@@ -256,10 +256,12 @@ def _author_points(points: Prim, placed: Placed) -> None:
     UsdGeom, Vt = openusd("UsdGeom", "Vt")
     body = placed.body
     points.GetPrim().AddAppliedSchema(tokens.POINTS_SIM_API)
-    points.CreateWidthsAttr(float_array(np.cbrt(body.weights)))  # edge of a cube of as much volume
+    points.CreateWidthsAttr(float_array(np.cbrt(body.cubature.weights)))  # edge of a cube of as much volume
     points.SetWidthsInterpolation(UsdGeom.Tokens.vertex)
-    set_points(points, body.points)
-    attribute(points.GetPrim(), tokens.MASSES, "FloatArray", float_array(body.weights * (placed.mass / body.volume)))
+    set_points(points, body.cubature.points)
+    attribute(
+        points.GetPrim(), tokens.MASSES, "FloatArray", float_array(body.cubature.weights * (placed.mass / body.volume))
+    )
     # What the physics is made of, not what one looks at: viewers hide it by default.
     points.CreatePurposeAttr(UsdGeom.Tokens.guide)
     points.CreateDisplayColorAttr(Vt.Vec3fArray([(0.2, 0.5, 0.9)]))

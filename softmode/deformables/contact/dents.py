@@ -74,7 +74,7 @@ def dent_lengths(body: ReducedBody) -> Array:
 
     Zero on exact regions, which are where they are driven to, and rigid.
     """
-    free = (np.abs(body.surface_basis[:, body.driven_count :]) > VANISHING).any(axis=1)
+    free = (np.abs(body.surface.basis[:, body.driven_count :]) > VANISHING).any(axis=1)
     return np.where(free, DENT_FACTOR * np.minimum(resolved_size(body), WALL_SHARE * thickness(body)), 0.0)
 
 
@@ -152,7 +152,7 @@ def dent_weights(body: ReducedBody, points: ArrayLike) -> DentWeights:
         body: The body.
         points: Rest points in the body frame [m], shape (N, 3).
     """
-    x, surface, normals = np.asarray(points, dtype=np.float64), body.surface_points, body.surface_normals
+    x, surface, normals = np.asarray(points, dtype=np.float64), body.surface.points, body.surface.normals
     near = KDTree(surface).query(x, min(4 * NEAREST, len(surface)))[1]
     arm = x[:, None] - surface[near]
     height = np.einsum("nkd,nkd->nk", arm, normals[near])
