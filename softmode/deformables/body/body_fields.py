@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -20,50 +20,25 @@ TABLES = {
     "detour_pairs": {"material_points", "material_frame", "detour_pairs", "detour_lengths"},
 }
 """Arrays that only the file of a body has whose kernels do not act across gaps, or go around corners."""
+_ORDER = (
+    ("", "name"),
+    ("cubature.", "points weights grad_basis stiffness_scale"),
+    ("surface.", "surface_points:points surface_normals:normals surface_areas:areas surface_basis:basis"),
+    ("", "volume mean_basis linear_coordinates eigenvalues bounds offset"),
+    (None, "centres radii kernel"),
+    ("handles.", "handles:coefficients handle_degrees:degrees handle_regions:blends"),
+    ("", "transform length driven_count"),
+    (None, "region_names region_stiffness region_radii region_cores core_index"),
+    ("regions.", "region_points:points region_index:index region_weights:weights drive drive_affine"),
+    ("", "fingerprint provenance build_seconds"),
+    ("regions.", "envelope_length"),
+    (None, "material_points hidden_pairs material_frame detour_pairs detour_lengths"),
+)
+"""Fields in the order of the files by their record, with its own name of a field after a colon; None if made."""
 PLACES = {
-    "name": "name",
-    "points": "cubature.points",
-    "weights": "cubature.weights",
-    "grad_basis": "cubature.grad_basis",
-    "stiffness_scale": "cubature.stiffness_scale",
-    "surface_points": "surface.points",
-    "surface_normals": "surface.normals",
-    "surface_areas": "surface.areas",
-    "surface_basis": "surface.basis",
-    "volume": "volume",
-    "mean_basis": "mean_basis",
-    "linear_coordinates": "linear_coordinates",
-    "eigenvalues": "eigenvalues",
-    "bounds": "bounds",
-    "offset": "offset",
-    "centres": "",
-    "radii": "",
-    "kernel": "",
-    "handles": "handles.coefficients",
-    "handle_degrees": "handles.degrees",
-    "handle_regions": "handles.blends",
-    "transform": "transform",
-    "length": "length",
-    "driven_count": "driven_count",
-    "region_names": "",
-    "region_stiffness": "",
-    "region_radii": "",
-    "region_cores": "",
-    "core_index": "",
-    "region_points": "regions.points",
-    "region_index": "regions.index",
-    "region_weights": "regions.weights",
-    "drive": "regions.drive",
-    "drive_affine": "regions.drive_affine",
-    "fingerprint": "fingerprint",
-    "provenance": "provenance",
-    "build_seconds": "build_seconds",
-    "envelope_length": "regions.envelope_length",
-    "material_points": "",
-    "hidden_pairs": "",
-    "material_frame": "",
-    "detour_pairs": "",
-    "detour_lengths": "",
+    name: "" if record is None else record + (own or name)
+    for record, fields in _ORDER
+    for name, _, own in (field.partition(":") for field in fields.split())
 }
 """Where a body has each field, in the order of the files; empty for what `made_fields` makes of kernels and regions."""
 GAPS: dict[str, Any] = {
@@ -78,17 +53,17 @@ QGMLS = "qgmls"
 """In place of the bell of reproducing kernels: the functions are those of Q-GMLS."""
 
 
-def made_fields(kernels: BasisRKPM | BasisQGMLS, regions: Sequence[Region]) -> dict[str, Any]:
+def made_fields(kernels: BasisRKPM | BasisQGMLS, regions: BodyRegions) -> dict[str, Any]:
     """Return the fields of kernels, those of gaps and corners among them, and of regions."""
-    cores = [region.cores for region in regions]
+    cores = [region.cores for region in regions.parts]
     found = {
         **GAPS,
         "centres": kernels.centres,
         "radii": kernels.radii,
         "kernel": kernels.kernel if isinstance(kernels, BasisRKPM) else QGMLS,
-        "region_names": tuple(region.name for region in regions),
-        "region_stiffness": np.array([region.stiffness or 0.0 for region in regions], dtype=np.float64),
-        "region_radii": np.array([region.radius for region in regions], dtype=np.float64),
+        "region_names": regions.names,
+        "region_stiffness": regions.stiffness,
+        "region_radii": np.array([region.radius for region in regions.parts], dtype=np.float64),
         "region_cores": np.concatenate([np.zeros((0, 2, 3)), *cores]),
         "core_index": np.repeat(np.arange(len(cores), dtype=np.int64), [len(core) for core in cores]),
     }
@@ -125,16 +100,15 @@ def records_of(fields: Mapping[str, Any]) -> dict[str, Any]:
 
 def _kernels(fields: Mapping[str, Any]) -> BasisRKPM | BasisQGMLS:
     """Return the kernels."""
-    if fields["kernel"] == QGMLS:
-        return BasisQGMLS(centres=fields["centres"], radii=fields["radii"])
-    points, visibility, detours = fields["material_points"], None, None
-    if len(fields["hidden_pairs"]):
-        visibility = Visibility(points=points, hidden=fields["hidden_pairs"])
-    if len(pairs := fields["detour_pairs"]):
-        frame, lengths = fields["material_frame"], fields["detour_lengths"]
-        detours = Detours(points=points, frame=frame, pairs=pairs, lengths=lengths)
     place = {"centres": fields["centres"], "radii": fields["radii"]}
-    return BasisRKPM(**place, kernel=fields["kernel"], visibility=visibility, detours=detours)
+    if fields["kernel"] == QGMLS:
+        return BasisQGMLS(**place)
+    points, hidden, pairs = fields["material_points"], fields["hidden_pairs"], fields["detour_pairs"]
+    tables: dict[str, Any] = {"visibility": Visibility(points=points, hidden=hidden) if len(hidden) else None}
+    if len(pairs):
+        frame, lengths = fields["material_frame"], fields["detour_lengths"]
+        tables["detours"] = Detours(points=points, frame=frame, pairs=pairs, lengths=lengths)
+    return BasisRKPM(**place, kernel=fields["kernel"], **tables)
 
 
 def _region(fields: Mapping[str, Any], i: int) -> Region:

@@ -373,7 +373,7 @@ class ReducedBody:
 
     def flat(self) -> dict[str, Any]:
         """Return all that makes up the body, without its sources, by the names and in the order that its file has."""
-        made = made_fields(self.kernels, self.regions.parts)
+        made = made_fields(self.kernels, self.regions)
         return {name: attrgetter(place)(self) if place else made[name] for name, place in PLACES.items()}
 
     @classmethod

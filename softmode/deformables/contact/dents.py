@@ -80,7 +80,7 @@ def dent_lengths(body: ReducedBody) -> Array:
 
 def neighbourhoods(body: ReducedBody) -> list[tuple[NDArray[np.int64], Array]]:
     """Return the samples around each that face the same way within 60 degrees, and their weights, of sum CARRIED."""
-    x, n, area = body.surface_points, body.surface_normals, body.surface_areas
+    x, n, area = body.surface.points, body.surface.normals, body.surface.areas
     radius = np.maximum(COVER * resolved_size(body), 1.5 * np.sqrt(area))
     found = []
     for s, near in enumerate(KDTree(x).query_ball_point(x, radius)):
@@ -92,7 +92,7 @@ def neighbourhoods(body: ReducedBody) -> list[tuple[NDArray[np.int64], Array]]:
 
 def mean_curvature(body: ReducedBody) -> Array:
     """Return the mean curvature at the samples [1/m], from the eight nearest whose normals are within 45 degrees."""
-    x, n = body.surface_points, body.surface_normals
+    x, n = body.surface.points, body.surface.normals
     near = KDTree(x).query(x, min(9, len(x)))[1].reshape(len(x), -1)[:, 1:]
     d, dn = x[near] - x[:, None], n[near] - n[:, None]
     same = np.einsum("ik,ijk->ij", n, n[near]) > 0.7
