@@ -351,6 +351,9 @@ def positive_field(name: str, value: Field | None, points: Array) -> Array:
 
 @contextlib.contextmanager
 def _reporter(progress: bool | Progress | None, name: str) -> Iterator[Progress]:
+    if callable(progress):
+        yield progress
+        return
     shown = progress if progress is not None else sys.stderr.isatty()
     if not shown:
         yield lambda stage, fraction: None
