@@ -162,11 +162,10 @@ def _first(body: ReducedBody, x: Array) -> tuple[str, Array]:
     """Return title and colours (N, 3) that show where a body is stiffer, or its regions."""
     from matplotlib import colormaps
 
-    low, high = body.cubature.stiffness_scale.min(), body.cubature.stiffness_scale.max()
+    scale = body.cubature.stiffness_scale
+    low, high = scale.min(), scale.max()
     if high > 1.0001 * low:
-        level = np.log(body.cubature.stiffness_scale[KDTree(body.cubature.points).query(x)[1]] / low) / np.log(
-            high / low
-        )
+        level = np.log(scale[KDTree(body.cubature.points).query(x)[1]] / low) / np.log(high / low)
         return f"stiffness x {low:.2g} to {high:.2g}", np.asarray(colormaps["viridis"](level))[:, :3]
     found = np.full((len(x), 3), 0.86)
     for region in body.regions.parts:

@@ -24,10 +24,9 @@ def soft_modes(body: ReducedBody, count: int | None = None) -> tuple[Array, Arra
         (rho V); and the lowest modes, of unit energy q . K q = 1, as coordinates q [m^(-1/2)], shape (count, n, 3).
     """
     free = slice(body.driven_count, None)
-    gradient = body.cubature.grad_basis.astype(np.float64)[:, free].transpose(1, 2, 0)
-    value, mode = elastic_modes(
-        reduced_stiffness(gradient, body.cubature.weights * body.cubature.stiffness_scale, POISSON_RATIO)
-    )
+    few = body.cubature
+    gradient = few.grad_basis.astype(np.float64)[:, free].transpose(1, 2, 0)
+    value, mode = elastic_modes(reduced_stiffness(gradient, few.weights * few.stiffness_scale, POISSON_RATIO))
     count = len(value) if count is None else min(count, len(value))
     q = np.zeros((count, body.function_count, 3))
     q[:, free] = mode[:, :count].T.reshape(count, 3, body.function_count - body.driven_count).transpose(0, 2, 1)
