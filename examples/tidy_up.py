@@ -41,7 +41,7 @@ def make_env(edge: int) -> PlaceInBinEnv:
 
 def picture_of(env: PlaceInBinEnv) -> np.ndarray:
     """Return what the overview camera sees of toys and bin."""
-    env.task.pictures.forget_film(np.ones(1, bool))
+    env.task.film.forget(np.ones(1, bool))
     picture = env.render()
     assert picture is not None
     edge = len(picture)

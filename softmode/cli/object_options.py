@@ -23,8 +23,7 @@ class ObjectOptions:
     """Your own object, and what it is made of. What is left out is as the task, the policy's run or the file has it."""
 
     splat: Path | None = None
-    """Splat file: .ply, .spz, .splat, .sog, a SOG folder or its meta.json, .usd; or a point cloud; or playbot, which
-    comes with softmode."""
+    """Splat file: .ply, .spz, .splat, .sog, a SOG folder or its meta.json, .usd; a point cloud; or playbot."""
     object: Path | None = None
     """File of any kind: a mesh, a body of `softmode body build`, splats, a radiance field, an OpenUSD stage; or a
     preset's name, see `softmode objects list`."""
@@ -35,8 +34,7 @@ class ObjectOptions:
     crop: tuple[float, float, float, float, float, float] | None = None
     """Box x0 y0 z0 x1 y1 z1 of a splat file, once turned up; what is outside is dropped."""
     part: Literal["thickest", "tallest", "largest", "all"] | tuple[int, ...] | None = None
-    """Which separate part of a splat file is the object: the thickest without what carries it, or numbers of the
-    candidates of `softmode splat show`, like 1 2."""
+    """Which part of a splat file is the object; or numbers of `softmode splat show`, like 1 2."""
     pose: Literal["stable", "captured"] | None = None
     """Lay what cannot stand on its stable side (stable), or leave it as it is."""
     resolution: int | None = None

@@ -63,7 +63,7 @@ def environment_features(
             features[f"observation.images.{camera}"] = Feature(dtype=kind, shape=part.shape)
         elif isinstance(part, Box) and len(part.shape) == 1 and key in ("", "agent_pos"):
             # The leading numbers are the robot's own; all, if the environment does not tell.
-            names, count, total = _names(task), getattr(task, "agent_size", 1 << 30), part.shape[0]
+            names, count, total = _names(task), 1 << 30 if task is None else task.layout.agent_size, part.shape[0]
             for name, columns in (
                 ("observation.state", slice(0, min(count, total))),
                 ("observation.environment_state", slice(count, total)),

@@ -70,7 +70,7 @@ class _Watched:
     @property
     def generation(self) -> tuple[int, ...]:
         """Changes where other objects are there."""
-        return tuple(self._scene.object_index.numpy().ravel().tolist())
+        return tuple(self._scene.occupancy.by_world.numpy().ravel().tolist())
 
     def splats(self) -> SplatPicture:
         """Return the splats of objects and goal."""

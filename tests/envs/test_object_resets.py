@@ -119,7 +119,7 @@ def test_each_reset_of_each_world_is_as_alone(task: str) -> None:
             _, rewards, *_, infos = many.step(np.tile(action, (2, 1)))
             rows.append(many.task.observation.numpy().copy())
             results.append((rewards, *(infos[name] for name in many.task.metric_names)))
-        many.task.pictures.forget_film(np.ones(2, bool))  # the camera follows from where it was
+        many.task.film.forget(np.ones(2, bool))  # the camera follows from where it was
         pictures = many.render()
         for world, k in enumerate(objects):
             single = singles[k]
@@ -130,7 +130,7 @@ def test_each_reset_of_each_world_is_as_alone(task: str) -> None:
                 np.testing.assert_array_equal(single.task.observation.numpy()[0], row[world])
                 assert [reward, *(info[name] for name in many.task.metric_names)] == [one[world] for one in result]
             if filmed:
-                single.task.pictures.forget_film(np.ones(1, bool))
+                single.task.film.forget(np.ones(1, bool))
                 np.testing.assert_array_equal(single.render(), pictures[world])
 
 
