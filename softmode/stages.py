@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 KERNELS = "loading kernels"
 """Stage in which modules are loaded, and compiled where the cache does not hold them."""
 PERIOD = 2.5
 """Seconds without a word after which it is said what goes on."""
-
-Told = Callable[[str, float], None]
 
 
 class _Watch:
@@ -23,37 +20,31 @@ class _Watch:
     def __init__(self) -> None:
         """Nothing is under way."""
         self.stages: list[tuple[str, float]] = []
-        self.listeners: list[Told] = []
         self.count = 0
         """Modules that were compiled since this stage began."""
         self.moved = 0.0
-        self._lock = threading.Lock()
-        self._thread: tuple[int, threading.Thread] | None = None
+        self.lock = threading.Lock()
+        self._thread: threading.Thread | None = None
 
-    def begin(self, name: str) -> None:
-        """Note a stage; the first one starts the thread."""
-        with self._lock:
+    def begin(self, name: str) -> tuple[str, float]:
+        """Note a stage, and return the note; the first one starts the thread."""
+        with self.lock:
             now = time.monotonic()
             if not self.stages:
                 self.moved = now
             if name != KERNELS or not self.stages or self.stages[-1][0] != KERNELS:
                 self.count = 0
             self.stages.append((name, now))
-            if self._thread is None or self._thread[0] != os.getpid() or not self._thread[1].is_alive():
-                thread = threading.Thread(target=self._run, name="stages", daemon=True)
-                self._thread = os.getpid(), thread
-                thread.start()
-
-    def end(self) -> None:
-        """Forget the innermost stage."""
-        with self._lock:
-            self.stages.pop()
+            if self._thread is None or not self._thread.is_alive():  # it is not in a process that was forked
+                self._thread = threading.Thread(target=self._run, name="stages", daemon=True)
+                self._thread.start()
+            return self.stages[-1]
 
     def _run(self) -> None:
         """Speak where nobody else has for a while, until nothing is under way."""
         while True:
             time.sleep(0.2 * PERIOD)
-            with self._lock:
+            with self.lock:
                 if not self.stages:
                     self._thread = None
                     return
@@ -63,9 +54,8 @@ class _Watch:
                 self.moved, (name, begun) = now, self.stages[-1]
                 if name == KERNELS and self.count:
                     name = f"compiling kernels (first run only, {self.count} modules so far)"
-                tell = self.listeners[-1] if self.listeners else _print
             with contextlib.suppress(OSError, ValueError):  # a stream that is closed
-                tell(name, now - begun)
+                _print(name, now - begun)
 
 
 _WATCH = _Watch()
@@ -78,21 +68,12 @@ def stage(name: str) -> Iterator[None]:
     Args:
         name: What goes on, such as "building the body".
     """
-    _WATCH.begin(name)
+    noted = _WATCH.begin(name)
     try:
         yield
     finally:
-        _WATCH.end()
-
-
-@contextlib.contextmanager
-def told_to(listener: Told) -> Iterator[None]:
-    """Pass what would be said in a block to a listener: a stage, and for how long it has gone on [s]."""
-    _WATCH.listeners.append(listener)
-    try:
-        yield
-    finally:
-        _WATCH.listeners.remove(listener)
+        with _WATCH.lock:
+            _WATCH.stages.remove(noted)  # the innermost may be that of another thread
 
 
 def moved() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -20,9 +19,10 @@ from softmode.objects.carriers import (
     Surface,
     best_axis,
     find_boundaries,
+    heavy,
     weighted_median,
 )
-from softmode.splats.components import disc_points, link_labels
+from softmode.splats.components import disc_points, link_labels, size_of
 from softmode.splats.splats import Splats
 
 Array = NDArray[np.float64]
@@ -42,6 +42,10 @@ class Cut:
     """Which lie under it, shape (N,); the rest are frays beside the contact."""
     floor: Array
     """Points a cell apart over the contact, shape (M, 3)."""
+    cell: float
+    """Edge of a cell."""
+    axis: Array
+    """Unit vector upwards across it, shape (3,)."""
 
 
 def cut_at(sections: Sections, boundary: Boundary, gap: float) -> Cut:
@@ -92,7 +96,8 @@ def cut_at(sections: Sections, boundary: Boundary, gap: float) -> Cut:
     cells = np.argwhere(contact)
     plan = (cells + 0.5) * sections.cell + sections.origin[:2]
     floor = np.column_stack([plan, boundary.height + plan @ shift[:2] + shift[2]])
-    return Cut(above=above, beneath=~above & (height < reach), floor=floor @ sections.basis)
+    beneath, place = ~above & (height < reach), floor @ sections.basis
+    return Cut(above=above, beneath=beneath, floor=place, cell=sections.cell, axis=sections.basis[2])
 
 
 def _plane(points: Array, height: Array, areas: Array, span: float, least: float) -> Array:
@@ -114,10 +119,7 @@ def _held(sections: Sections, boundary: Boundary) -> Mask:
     i, j = sections.cells_of(sections.surface.points)
     first = min(sections.layer_of(boundary.height) + boundary.reach + 2, len(sections.solid) - 1)
     solid = sections.solid[first : first + 12]
-    piece: Any = ndimage.label(solid)
-    bulk = np.bincount(piece[0].ravel(), minlength=piece[1] + 1)
-    bulk[0] = 0
-    held = ndimage.binary_dilation((bulk >= 0.05 * bulk.sum())[piece[0]], np.ones((3, 3, 3)))
+    held = ndimage.binary_dilation(heavy(solid), np.ones((3, 3, 3)))
     low = ndimage.binary_dilation(boundary.contact, iterations=3)[i, j]
     k = np.floor((sections.surface.points[:, 2] - sections.origin[2]) / sections.layer).astype(int) - first
     return (k > 6) | low | ((k >= 1) & held[np.clip(k, 0, len(held) - 1), i, j])
@@ -128,15 +130,13 @@ class Pieces:
     """A captured thing, cut where one piece of it may stand on another."""
 
     number: NDArray[np.intp]
-    """Piece of each splat, from the top on from 1, shape (N,); 0 for frays."""
+    """Piece of each splat, from the top on from 1, shape (N,), or () for all; 0 for frays."""
     cuts: tuple[Cut, ...]
     """The cuts between the pieces, from the top on."""
     boundaries: tuple[Boundary, ...]
     """What is there."""
     top: int
     """The pieces from the first to this one are the object, the others carry it."""
-    sections: Sections
-    """The sections of the thing."""
 
     @property
     def count(self) -> int:
@@ -149,14 +149,13 @@ class Pieces:
         for k, cut in enumerate(self.cuts, start=1):
             if (k in taken) == (k + 1 in taken):
                 continue
-            turn = Rotation.align_vectors([self.sections.basis[2]], [[0.0, 0.0, 1.0]])[0].as_quat()
-            edge, count = self.sections.cell, len(cut.floor)
-            near = thing.subset(np.isin(self.number, list(taken)))
+            turn = Rotation.align_vectors([cut.axis], [[0.0, 0.0, 1.0]])[0].as_quat()
+            count, near = len(cut.floor), thing.subset(np.isin(self.number, list(taken)))
             found.append(
                 Splats(
                     means=cut.floor,
                     quats=np.tile(turn, (count, 1)),
-                    scales=np.tile([edge, edge, 0.1 * edge], (count, 1)),
+                    scales=np.tile([cut.cell, cut.cell, 0.1 * cut.cell], (count, 1)),
                     opacities=np.full(count, 0.95),
                     sh=near.sh[KDTree(near.means).query(cut.floor)[1], :1],
                     offset=thing.offset,
@@ -164,64 +163,61 @@ class Pieces:
             )
         return found
 
-    @cached_property
+    @property
     def told(self) -> dict[str, str | int | float]:
         """What a report says of the carrier, and of what may be one or may be none."""
-
-        def option(last: int) -> str:
-            return " ".join(map(str, range(1, last + 1)))
-
+        if not self.cuts:
+            return {}
+        options = [" ".join(map(str, range(1, last + 1))) for last in range(1, self.count + 1)]
         heights = [float(cut.floor[:, 2].mean()) for cut in self.cuts]
         scores = [boundary.score for boundary in self.boundaries]
+        places = [f"z = {height:.4g} (score {score:.2f})" for height, score in zip(heights, scores, strict=True)]
+        takes = [*(f"what is above {height:.4g}" for height in heights), "all of it"]
+        doubts = {k: score for k, score in enumerate(scores) if k != self.top - 1}
         told: dict[str, str | int | float] = {}
-        doubts = {k: score for k, score in enumerate(scores, start=1) if k != self.top}
-        if self.top < self.count:
-            score = scores[self.top - 1]
-            told |= {
-                "carrier": self.boundaries[self.top - 1].kind,
-                "carrier_splats": int((self.number > self.top).sum()),
-                "carrier_height": heights[self.top - 1],
-                "carrier_score": score,
-                "carrier_part": option(self.count),
-            }
-            if score > SURE and max(doubts.values(), default=0.0) < LIKELY:
-                return told
-            others = ", ".join(f"z = {heights[k - 1]:.4g} (score {found:.2f})" for k, found in doubts.items())
-            told["doubt"] = f"it was cut off what carries it at z = {heights[self.top - 1]:.4g} (score {score:.2f})"
-            told["doubt"] += f"; it may end elsewhere: {others}" if others else ", which is not sure"
-            doubts[self.count] = 1.0 - score
+        if self.top == self.count:
+            most = max(doubts, key=lambda k: doubts[k])
+            doubt = f"it was kept whole, but may be carried by what is below {places[most]}"
         else:
-            k = max(doubts, key=lambda k: doubts[k])
-            told["doubt"] = f"it was kept whole, but may be carried by what is below z = {heights[k - 1]:.4g}"
-            told["doubt"] += f" (score {doubts[k]:.2f})"
-        parts = {
-            k: f"--part {option(k)} takes "
-            + ("all of it" if k == self.count else f"what is above {heights[k - 1]:.4g}")
-            for k in sorted(doubts, key=lambda k: -doubts[k])
-        }
-        told["doubt_remedy"] = "look at it (softmode splat show); " + ", ".join(parts.values())
-        return told
+            k = self.top - 1
+            told |= {
+                "carrier": self.boundaries[k].kind,
+                "carrier_splats": int((self.number > self.top).sum()),
+                "carrier_height": heights[k],
+                "carrier_score": scores[k],
+                "carrier_part": options[-1],
+            }
+            if scores[k] > SURE and max(doubts.values(), default=0.0) < LIKELY:
+                return told
+            others = ", ".join(places[other] for other in doubts)
+            doubt = f"it was cut off what carries it at {places[k]}"
+            doubt += f"; it may end elsewhere: {others}" if others else ", which is not sure"
+            doubts[self.count - 1] = 1.0 - scores[k]
+        named = [f"--part {options[k]} takes {takes[k]}" for k in sorted(doubts, key=lambda k: -doubts[k])]
+        return told | {"doubt": doubt, "doubt_remedy": "look at it (softmode splat show); " + ", ".join(named)}
 
 
-def divide(thing: Splats, normal: Array | None, gap: float) -> Pieces | None:
-    """Cut a thing where one piece of it may stand on another; None where nothing does.
+WHOLE = Pieces(number=np.array(1), cuts=(), boundaries=(), top=1)
+"""A thing that nothing carries, all of it one piece."""
+
+
+def divide(thing: Splats, normal: Array | None, gap: float) -> Pieces:
+    """Cut a thing where one piece of it may stand on another; `WHOLE` where nothing does.
 
     Args:
         thing: One part of a capture, z up.
         normal: Normal of the ground that it stands on, shape (3,), None if there is none.
         gap: Distance up to which splats hang together.
     """
-    low, high = thing.bounds(quantile=0.01)
-    wide = 0.25 * float(np.linalg.norm(high - low))
-    solid = np.flatnonzero((thing.opacities >= 0.2) & (thing.scales.max(axis=1) < wide))
+    solid = np.flatnonzero((thing.opacities >= 0.2) & (thing.scales.max(axis=1) < 0.25 * size_of(thing)))
     if len(solid) < 500:
-        return None
+        return WHOLE
     surface = Surface.of(thing.subset(solid))
     axis = best_axis(surface, np.array([0.0, 0.0, 1.0])) if normal is None else normal
     sections = Sections(surface, axis)
     found, chosen = find_boundaries(sections)
     if not found:
-        return None
+        return WHOLE
     ranked = sorted(found, key=lambda boundary: -boundary.score - 2.0 * (boundary is chosen))[: PIECES - 1]
     ranked.sort(key=lambda boundary: -boundary.height)
     cuts = [cut_at(sections, boundary, gap) for boundary in ranked]
@@ -231,5 +227,5 @@ def divide(thing: Splats, normal: Array | None, gap: float) -> Pieces | None:
     away, nearest = KDTree(surface.points).query(thing.means)
     every = np.where(away < 0.5 * gap, number[nearest], 0)
     every[solid] = number
-    top = len(cuts) + 1 if chosen is None else 1 + next(k for k, found in enumerate(ranked) if found is chosen)
-    return Pieces(number=every, cuts=tuple(cuts), boundaries=tuple(ranked), top=top, sections=sections)
+    top = next((k for k, boundary in enumerate(ranked, start=1) if boundary is chosen), len(cuts) + 1)
+    return Pieces(number=every, cuts=tuple(cuts), boundaries=tuple(ranked), top=top)

@@ -6,7 +6,7 @@ is free all around, on which what stands can stand alone, with something plainer
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -16,7 +16,7 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull, KDTree
 
 from softmode.deformables.quadrature.shell_views import spread_samples
-from softmode.splats.splats import Splats, rotations_from_quats
+from softmode.splats.splats import Splats
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -49,24 +49,21 @@ class Surface:
     @classmethod
     def of(cls, splats: Splats) -> Surface:
         """Return the discs of splats."""
-        points, scales = splats.means.astype(np.float64), splats.scales.astype(np.float64)
-        order = np.argsort(-scales, axis=1, kind="stable")
-        axes = np.take_along_axis(rotations_from_quats(splats.quats).astype(np.float64), order[:, None], axis=2)
-        scales = np.take_along_axis(scales, order, axis=1)
-        areas = splats.opacities * scales[:, 0] * scales[:, 1]
+        points, (normals, tangents) = splats.means.astype(np.float64), splats.discs()
+        areas = splats.opacities * np.linalg.norm(tangents, axis=1).prod(axis=1)
         few: Any = KDTree(points).query(points[:: max(1, len(points) // 20_000)], k=min(7, len(points)))
         return cls(
             points=points,
-            normals=axes[:, :, 2],
-            tangents=axes[:, :, :2] * scales[:, None, :2],
+            normals=normals,
+            tangents=tangents,
             areas=np.minimum(areas, np.quantile(areas, 0.995)),
             pitch=float(np.median(few[0][:, -1])),
         )
 
     def turned(self, basis: Array) -> Surface:
         """Return it in the coordinates of a basis, whose rows are unit vectors."""
-        turned = {name: getattr(self, name) @ basis.T for name in ("points", "normals")}
-        return replace(self, tangents=np.einsum("ij,njk->nik", basis, self.tangents), **turned)
+        points, normals = self.points @ basis.T, self.normals @ basis.T
+        return replace(self, points=points, normals=normals, tangents=basis @ self.tangents)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -83,8 +80,10 @@ class Boundary:
     """Outline of what stands on it, in cells of the sections."""
     reach: int = 1
     """Layers on either side over which the top spreads."""
-    why: dict[str, float] = field(default_factory=dict)
-    """What the score is made of."""
+    convexity: float = 0.0
+    """Area of the outline below a top over that of its hull."""
+    plain_above: float = 0.0
+    """Share of the area above a top that lies level or upright."""
 
 
 def ramp(x: float, low: float, high: float) -> float:
@@ -94,9 +93,7 @@ def ramp(x: float, low: float, high: float) -> float:
 
 def weighted_median(values: Array, weights: Array) -> float:
     """Return the value below which half of the weight lies."""
-    order = np.argsort(values)
-    total = np.cumsum(weights[order])
-    return float(values[order][np.searchsorted(total, 0.5 * total[-1])])
+    return float(np.quantile(values, 0.5, weights=weights, method="inverted_cdf"))
 
 
 def best_axis(surface: Surface, up: Array) -> Array:
@@ -129,35 +126,22 @@ def best_axis(surface: Surface, up: Array) -> Array:
     return tried[best] if share[best] > 1.1 * share[0] else up
 
 
-def _hull_of(mask: Mask) -> tuple[float, Array]:
-    """Return the area of the convex hull of cells, and its corners in their order, both in cells."""
-    cells = np.argwhere(mask).astype(np.float64)
-    if len(cells) < 4 or (np.ptp(cells, axis=0) == 0).any():
-        return float(len(cells)), cells
-    cells = np.concatenate([cells + np.array([a, b]) for a in (-0.5, 0.5) for b in (-0.5, 0.5)])
-    hull = ConvexHull(cells)
-    return float(hull.volume), cells[hull.vertices]
-
-
-def _edge_distance(corners: Array, point: Array) -> float:
-    """Return how far a point lies inside a convex polygon whose corners run counter-clockwise; negative outside."""
-    edge = np.roll(corners, -1, axis=0) - corners
-    off = edge[:, 0] * (point[1] - corners[:, 1]) - edge[:, 1] * (point[0] - corners[:, 0])
-    return float((off / np.maximum(np.linalg.norm(edge, axis=1), 1e-12)).min())
+def _hull_of(mask: Mask) -> ConvexHull:
+    """Return the convex hull of cells, of which there are some, in cells; its `volume` is its area."""
+    cells = np.argwhere(mask)
+    return ConvexHull(np.concatenate([cells + np.array([a, b]) for a in (-0.5, 0.5) for b in (-0.5, 0.5)]))
 
 
 def convexity(mask: Mask) -> float:
     """Return the area of cells over that of their hull."""
-    return float(mask.sum()) / max(_hull_of(mask)[0], 1.0)
+    return float(mask.sum()) / float(_hull_of(mask).volume)
 
 
-def _outline(corners: Array, count: int) -> Array:
-    """Return points at equal distances along a closed polygon."""
-    edge = np.roll(corners, -1, axis=0) - corners
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(edge, axis=1))])
-    at = np.linspace(0.0, along[-1], count, endpoint=False)
-    i = np.searchsorted(along, at, side="right") - 1
-    return corners[i] + edge[i] * ((at - along[i]) / np.maximum(along[i + 1] - along[i], 1e-12))[:, None]
+def _outline(hull: ConvexHull, count: int) -> Array:
+    """Return points at equal distances along a hull, shape (2, count)."""
+    corners = hull.points[np.append(hull.vertices, hull.vertices[0])]
+    along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1)))
+    return np.stack([np.interp(np.linspace(0.0, along[-1], count, endpoint=False), along, x) for x in corners.T])
 
 
 def filled(mask: Any) -> Mask:
@@ -165,7 +149,7 @@ def filled(mask: Any) -> Mask:
     return np.asarray(ndimage.binary_fill_holes(mask))
 
 
-def _heavy(solid: Mask) -> Mask:
+def heavy(solid: Mask) -> Mask:
     """Return which cells belong to pieces of a twentieth of the volume and more."""
     piece: Any = ndimage.label(solid)
     bulk = np.bincount(piece[0].ravel(), minlength=piece[1] + 1)
@@ -204,7 +188,7 @@ class Sections:
         wide = np.ceil((high[:2] - self.origin[:2]) / self.cell).astype(int) + 6
         count = int(np.ceil((z1 - z0) / self.layer)) + 1
         sample, owner = spread_samples(x, 1.5 * self.surface.tangents, 0.7 * self.cell)
-        index = np.floor((sample - self.origin) / self.edges).astype(int)
+        index = np.floor((sample - self.origin) / [self.cell, self.cell, self.layer]).astype(int)
         good = ((index >= 0) & (index < (*wide, count))).all(axis=1)
         (i, j, k), flat = index[good].T, np.abs(self.surface.normals[owner[good], 2]) > 0.85
         shell = np.zeros((count, *wide), dtype=bool)
@@ -217,20 +201,14 @@ class Sections:
         for k in range(count):
             two = ndimage.binary_dilation(shell[max(0, k - 1) : k + 1].any(axis=0), DISC)
             self.solid[k] = ndimage.binary_opening(ndimage.binary_erosion(filled(two), DISC), np.ones((2, 2)))
-        rows, columns = np.arange(wide[0]), np.arange(wide[1])
         cells = self.solid.sum(axis=(1, 2))
         self.areas = cells * self.cell**2
         """Areas of the sections, shape (layers,)."""
-        middle = [self.solid.sum(axis=2) @ rows, self.solid.sum(axis=1) @ columns]
+        middle = [self.solid.sum(axis=2 - k) @ np.arange(wide[k]) for k in (0, 1)]
         self.centres = np.stack(middle, axis=1) / np.maximum(cells, 1)[:, None]
         """Their centres [cells], shape (layers, 2)."""
         self.heights = z0 + self.layer * (np.arange(count) + 0.5)
         """Heights of the layers."""
-
-    @property
-    def edges(self) -> Array:
-        """Edges of a cell."""
-        return np.array([self.cell, self.cell, self.layer])
 
     def layer_of(self, height: float) -> int:
         """Return the layer at a height."""
@@ -313,17 +291,17 @@ class Sections:
     def _scored(self, k: int, reach: int, below: Mask, cover: float) -> list[Boundary]:
         """Return the top at a layer with its score, if anything goes on upwards from it."""
         # What stands on it goes on upwards; frays of the rim do not.
-        above = _heavy(self.solid[k + reach + 2 :])[:2].any(axis=0)
+        above = heavy(self.solid[k + reach + 2 :])[:2].any(axis=0)
         near = ndimage.binary_dilation(above, iterations=max(2, round(0.03 * self.size / self.cell)))
         above |= (self.solid[k + reach : k + reach + 3].sum(axis=0) >= 2) & near
         if not above.any():
             return []
-        hull, corners = _hull_of(below)
+        hull, foot = _hull_of(below), _hull_of(above)
+        convex = float(below.sum() / hull.volume)
         far = ndimage.distance_transform_edt(~above)
-        margin: Any = ndimage.map_coordinates(far, _outline(corners, 240).T, order=1, mode="nearest")
+        margin: Any = ndimage.map_coordinates(far, _outline(hull, 240), order=1, mode="nearest")
         around = float((margin > max(2.5, 0.05 * np.sqrt(below.sum()))).mean())
-        area, outline = _hull_of(above)
-        radius = np.sqrt(area / np.pi)
+        radius = float(np.sqrt(foot.volume / np.pi))
         bulk = np.where(np.arange(len(self.areas)) > k + reach, self.areas, 0.0)
         centre = bulk @ self.centres / max(float(bulk.sum()), 1e-300)
         rise = max(float(bulk @ (self.heights - self.heights[k])) / max(float(bulk.sum()), 1e-300) / self.cell, 1e-9)
@@ -333,7 +311,7 @@ class Sections:
         contrast = max(ramp(plain - plain_above, 0.15, 0.4), ramp(coarse / fine, 1.8, 3.5))
         extent = max(float(np.ptp(np.argwhere(above), axis=0).max()) * self.cell, self.heights[-1] - self.heights[k])
         held, most = float(bulk.sum() / self.areas.sum()), extent / self.size
-        steady = _edge_distance(outline, centre) / rise
+        steady = -float((foot.equations @ [*centre, 1.0]).max()) / rise  # how far inside the edge it stands
         # The discs of its top may stand out beyond its edges: a prism is as wide as its upper half is on the whole.
         lower = self.areas[: max(1, k - reach)]
         prism = float((lower > 0.8 * np.median(lower[len(lower) // 2 :])).mean())
@@ -341,9 +319,9 @@ class Sections:
         why = {
             "level": ramp(cover, 0.18, 0.42),
             "free": ramp(around + 0.3 * contrast, 0.7, 0.85),
-            "convex": ramp(float(below.sum()) / max(hull, 1.0), 0.6, 0.8),
+            "convex": ramp(convex, 0.6, 0.8),
             "stands": ramp(radius / rise, 0.17, 0.3) * ramp(steady, 0.0, 0.05),
-            "over": ramp(-lean / max(radius, 1e-9), -1.6, -1.1),
+            "over": ramp(-lean / radius, -1.6, -1.1),
             "plain": ramp(plain, 0.45, 0.6),
             "carrier": ramp(max(contrast, ramp(prism, 0.6, 0.85), ramp(legs, 0.5, 0.7)), 0.1, 0.5),
             "smaller": ramp(-float(above.sum() / below.sum()), -0.95, -0.85),
@@ -351,21 +329,15 @@ class Sections:
         }
         # A boxy thing on a box may be the hood of a car: a doubt is named.
         score = min(float(np.prod(list(why.values()))), 0.99 * SURE if plain_above > 0.9 else 1.0)
-        why |= {
-            "steady": steady,
-            "held": held,
-            "most": most,
-            "convexity": float(below.sum()) / max(hull, 1.0),
-            "plain above": plain_above,
-        }
-        top = Boundary(kind="top", height=float(self.heights[k]), score=score, contact=above, reach=reach, why=why)
+        named = {"convexity": convex, "plain_above": plain_above}
+        top = Boundary(kind="top", height=float(self.heights[k]), score=score, contact=above, reach=reach, **named)
         return [top]
 
     def stem(self) -> list[Boundary]:
         """Return the end of a thin prism in one piece under something much wider, if there is one."""
         widest = np.maximum.accumulate(self.areas[::-1])[::-1]
         thin: Any = ndimage.label((self.areas > 0.0) & (self.areas < 0.15 * widest))
-        best: list[Boundary] = []
+        found: list[Boundary] = []
         for piece in range(1, thin[1] + 1):
             rows = np.flatnonzero(thin[0] == piece)
             rows = rows[1:-1] if len(rows) > 4 else rows
@@ -375,9 +347,8 @@ class Sections:
             even = float((np.abs(self.areas[rows] - area) < 0.35 * area).mean())
             drift = np.ptp(np.quantile(self.centres[rows], [0.1, 0.9], axis=0), axis=0).max() * self.cell
             whole = float(np.median([convexity(self.solid[k]) for k in rows]))
-            end = int(rows[-1]) + 1
-            while end < len(self.areas) - 1 and self.areas[end] < 1.6 * area:
-                end += 1
+            grown = np.append(self.areas[rows[-1] + 1 : -1], np.inf) >= 1.6 * area
+            end = min(int(rows[-1]) + 1 + int(grown.argmax()), len(self.areas) - 1)
             why = {
                 "even": ramp(even, 0.5, 0.8),
                 "straight": ramp(-float(drift) / np.sqrt(area), -1.2, -0.6),
@@ -385,12 +356,9 @@ class Sections:
                 "not turned": ramp(-self.turned_share, -0.85, -0.7),
                 "enough": ramp(float(self.areas[end:].sum() / self.areas.sum()), 0.1, 0.3),
             }
-            score = float(np.prod(list(why.values())))
-            if not best or score > best[0].score:
-                end = min(end, len(self.heights) - 1)
-                contact, height = self.solid[end], float(self.heights[end])
-                best = [Boundary(kind="stem", height=height, score=score, contact=contact, why=why)]
-        return best
+            score, height = float(np.prod(list(why.values()))), float(self.heights[end])
+            found.append(Boundary(kind="stem", height=height, score=score, contact=self.solid[end]))
+        return sorted(found, key=lambda stem: -stem.score)[:1]
 
 
 def is_step(sections: Sections, lower: Boundary, upper: Boundary) -> bool:
@@ -402,9 +370,9 @@ def is_step(sections: Sections, lower: Boundary, upper: Boundary) -> bool:
     between = [convexity(mask) for mask in sections.solid[first + 3 : last - 2] if mask.any()]
     convex = float(np.median(between)) if between else 0.0
     if last - first < 10:
-        convex = max(convex, upper.why["convexity"])
+        convex = max(convex, upper.convexity)
     plain, _, _ = sections.look(lower.height + sections.layer, upper.height + sections.layer)
-    return convex > 0.8 and plain > 0.6 and plain - upper.why["plain above"] > 0.15
+    return convex > 0.8 and plain > 0.6 and plain - upper.plain_above > 0.15
 
 
 def find_boundaries(sections: Sections) -> tuple[list[Boundary], Boundary | None]:

@@ -154,8 +154,9 @@ class ObjectConfig:
             require_number("resolution", self.resolution, at_least=16, at_most=512)
         if self.crop is not None and not all(a < b for a, b in zip(self.crop[:3], self.crop[3:], strict=True)):
             raise ConfigError(f"crop {self.crop} is empty", hint="give x0 y0 z0 x1 y1 z1 with every 0 below its 1")
+        numbers = isinstance(self.part, tuple) and self.part and all(isinstance(k, int) for k in self.part)
         for name, known in (("shape", Shape), ("up", UpAxis), ("part", Rule), ("pose", Pose)):
-            if not ((name == "up" and self.up is None) or (name == "part" and self._numbers)):
+            if not ((name == "up" and self.up is None) or (name == "part" and numbers)):
                 require_choice(name, getattr(self, name), get_args(known))
         files = (self.preset, self.splat, self.mesh, self.radiance, self.body)
         if sum(file is not None for file in files) + (self.shape != "plush") > 1:
@@ -180,11 +181,6 @@ class ObjectConfig:
                 )
             if np.shape(self.colors) != (2, 3) or not all(0.0 <= x <= 1.0 for color in self.colors for x in color):
                 raise ConfigError(f"colors {self.colors} are not two colours", hint="give two of (r, g, b) in 0..1")
-
-    @property
-    def _numbers(self) -> bool:
-        """Whether `part` is numbers of candidates."""
-        return isinstance(self.part, tuple) and bool(self.part) and all(isinstance(k, int) for k in self.part)
 
     @property
     def kind(self) -> str:

@@ -11,10 +11,10 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from softmode.errors import ConfigError
-from softmode.objects.carrier_cut import divide
+from softmode.objects.carrier_cut import WHOLE, divide
 from softmode.objects.rooms import crop_of, scene_crop
-from softmode.splats.components import label_components
-from softmode.splats.splats import Splats, joined, rotations_from_quats
+from softmode.splats.components import label_components, size_of
+from softmode.splats.splats import Splats, joined
 
 Rule = Literal["thickest", "tallest", "largest", "all"]
 Part = Rule | tuple[int, ...]
@@ -70,48 +70,44 @@ def choose_part(splats: Splats, rule: Part) -> Choice:
         every = np.arange(splats.count)
         return Choice(part=splats, rows=every, number=np.ones_like(every), taken=(1,), told={})
     ground = None if rule == "largest" else find_ground(splats)
-    scene = np.arange(splats.count) if ground is None else np.flatnonzero(~ground.splats)
-    gap, label = _linked(splats.subset(scene) if ground is not None else splats)
+    floor = np.zeros(splats.count, dtype=bool) if ground is None else ground.splats
+    scene = np.flatnonzero(~floor)
+    gap, label = _linked(splats.subset(scene))
     parts = [scene[label == k] for k in range(int(label.max(initial=-1)) + 1)] or [np.arange(splats.count)]
     things, order = [splats.subset(rows) for rows in parts], list(range(len(parts)))
-    first = None
-    if rule == "largest":
-        chosen = 0
-    elif rule == "tallest":
+    first = chosen = 0
+    if rule == "tallest":
         chosen = max(order, key=lambda k: float(np.ptp(things[k].bounds(quantile=0.005)[:, 2])))
-    else:
+    elif rule != "largest":
         chosen = first = max(order, key=lambda k: _thickness(things[k]))
         while ground is not None and (inner := [k for k in order if _surrounds(things[chosen], things[k])]):
             chosen = max(inner, key=lambda k: _thickness(things[k]))
     number, others = np.zeros(splats.count, dtype=np.intp), [k for k in order if k != chosen]
-    pieces = None
+    pieces = WHOLE
     if rule not in ("largest", "tallest"):
         pieces = divide(things[chosen], None if ground is None else ground.normal, gap)
-    number[parts[chosen]] = 1 if pieces is None else pieces.number
-    count = 1 if pieces is None else pieces.count
-    for k, mark in zip(others, range(count + 1, CANDIDATES + 1), strict=False):
+    number[parts[chosen]] = pieces.number
+    for k, mark in zip(others, range(pieces.count + 1, CANDIDATES + 1), strict=False):
         number[parts[k]] = mark
-    taken = rule if isinstance(rule, tuple) else tuple(range(1, 2 if pieces is None else pieces.top + 1))
+    taken = rule if isinstance(rule, tuple) else tuple(range(1, pieces.top + 1))
     if missing := set(taken) - set(number.tolist()):
         raise ConfigError(
             f"part {' '.join(map(str, sorted(missing)))}: the capture has the candidates 1 to {number.max()}",
             hint="`softmode splat show FILE` draws them with their numbers",
         )
     part, rows = things[chosen], parts[chosen]
-    if set(taken) != set(range(1, count + 1)):
-        floors = [] if pieces is None else pieces.floors(set(taken), things[chosen])
+    if set(taken) != set(range(1, pieces.count + 1)):
         rows = np.flatnonzero(np.isin(number, taken))
-        part = joined([splats.subset(rows), *floors], splats.name)
+        part = joined([splats.subset(rows), *pieces.floors(set(taken), things[chosen])], splats.name)
     told: dict[str, str | int | float] = {"part_splats": len(rows), "floor_splats": part.count - len(rows)}
-    told["ground_splats"] = 0 if ground is None else int(ground.splats.sum())
+    told["ground_splats"] = int(floor.sum())
     other = next((things[k] for k in others if things[k].count >= SURROUNDED * things[chosen].count), None)
     if other is not None:
-        told |= {"other_splats": other.count, "other_crop": crop_of(other), "other_part": count + 1}
+        told |= {"other_splats": other.count, "other_crop": crop_of(other), "other_part": pieces.count + 1}
     if rule == "thickest":
-        told |= {} if pieces is None else pieces.told
-        if crop := scene_crop(
-            things[chosen], [things[k] for k in others], within=first not in (None, chosen), grounded=ground is not None
-        ):
+        told |= pieces.told
+        rest, within = [things[k] for k in others], first != chosen
+        if crop := scene_crop(things[chosen], rest, within=within, grounded=ground is not None):
             told["scene_crop"] = crop
     return Choice(part=part, rows=rows, number=number, taken=taken, told=told)
 
@@ -120,10 +116,9 @@ def _linked(scene: Splats) -> tuple[float, NDArray[np.intp]]:
     """Return the gap that parts the things of a scene, and the part of each of its splats (N,), -1 for none."""
     # The wider of a fraction of the capture and what its own pitch calls for: a small file of one object is sparse. Of
     # points strewn at random on a surface, n exp(-5.7 f^2) have no neighbour within f median sixth distances.
-    low, high = scene.bounds(quantile=0.01)
     few = scene.means[:: max(1, scene.count // 20_000)]
     pitch = 1.5 * np.median(KDTree(scene.means).query(few, k=min(7, scene.count))[0][:, -1])
-    gap = max(0.015 * float(np.linalg.norm(high - low)), float(pitch), 1.0e-9)
+    gap = max(0.015 * size_of(scene), float(pitch), 1.0e-9)
     return gap, label_components(scene, gap=gap, faces=True)
 
 
@@ -148,35 +143,29 @@ def find_ground(splats: Splats) -> Ground | None:
     solid = np.flatnonzero(splats.opacities >= 0.2)
     if len(solid) < 200:
         return None
-    x = splats.means[solid].astype(np.float64)
-    scale = np.sort(splats.scales[solid].astype(np.float64), axis=1)
-    thin = splats.scales[solid].argmin(axis=1)
-    normal = rotations_from_quats(splats.quats[solid])[np.arange(len(solid)), :, thin].astype(np.float64)
-    area = scale[:, 1] * scale[:, 2]
+    firm = splats.subset(solid)
+    x, size, (normal, tangents) = firm.means.astype(np.float64), size_of(firm), firm.discs()
+    area = np.linalg.norm(tangents, axis=1).prod(axis=1)
     area = np.minimum(area, np.quantile(area, 0.99))
-    low, high = np.quantile(x, [0.01, 0.99], axis=0)
-    size = float(np.linalg.norm(high - low))
     few = np.random.default_rng(0).permutation(len(solid))[:3000]
     tried = few[:300]
     near = np.abs(x[few] @ normal[tried].T - (x[tried] * normal[tried]).sum(axis=1)) < 0.01 * size
     near &= np.abs(normal[few] @ normal[tried].T) > 0.8
     best = tried[(area[few] @ near).argmax()]
-    axis, middle, reach = normal[best], x[best], 0.01 * size
-    flat = np.zeros(len(x), dtype=bool)
-    for _ in range(3):
+    axis, middle, reach, left = normal[best], x[best], 0.01 * size, 3
+    while True:
         height = (x - middle) @ axis
         flat = (np.abs(height) < reach) & (np.abs(normal @ axis) > 0.8)
         if flat.sum() < 100:
             return None
-        flat = _fullest(height, flat, area)
-        middle = x[flat].mean(axis=0)
-        axis = np.linalg.svd((x[flat] - middle)[:: max(1, int(flat.sum()) // 5000)], full_matrices=False)[2][2]
-        off = np.abs((x[flat] - middle) @ axis)
-        reach = float(np.clip(5.0 * np.median(off), 0.002 * size, 0.01 * size))
-    height = (x - middle) @ axis
-    flat = (np.abs(height) < reach) & (np.abs(normal @ axis) > 0.8)
+        if not left:
+            break
+        near, left = x[_fullest(height, flat, area)], left - 1
+        middle = near.mean(axis=0)
+        axis = np.linalg.svd((near - middle)[:: max(1, len(near) // 5000)], full_matrices=False)[2][2]
+        reach = float(np.clip(5.0 * np.median(np.abs((near - middle) @ axis)), 0.002 * size, 0.01 * size))
     rest = np.abs(height) > 2.0 * reach
-    if flat.sum() < 100 or area[flat].sum() < GROUND_SHARE * area.sum() or rest.sum() < 0.02 * len(x):
+    if area[flat].sum() < GROUND_SHARE * area.sum() or rest.sum() < 0.02 * len(x):
         return None
     side_up = float(np.sign(np.median(height[rest])))
     above = height[rest] * side_up
@@ -187,15 +176,12 @@ def find_ground(splats: Splats) -> Ground | None:
     plan = (x - middle) @ np.stack([side, np.cross(axis, side)], axis=1)
     # Cells that hold ten splats of the plane on average; holes between them do not count.
     cell = max(float(np.sqrt(10.0 * np.ptp(plan[flat], axis=0).prod() / flat.sum())), 0.01 * size)
-    index = np.floor((plan - plan.min(axis=0)) / cell).astype(np.int64)
-    key = index[:, 0] * (index[:, 1].max() + 1) + index[:, 1]
-    held, over = np.bincount(key[flat], minlength=key.max() + 1), np.bincount(key[rest], minlength=key.max() + 1)
+    edges = [np.arange(along.min(), along.max() + cell, cell) for along in plan.T]
+    held, over = (np.histogram2d(*plan[some].T, edges)[0] for some in (flat, rest))
     floor = held >= 2
     if (over[floor] >= 0.25 * held[floor]).mean() >= GROUND_COVER:
         return None
-    every = np.abs((splats.means.astype(np.float64) - middle) @ axis) < reach
-    faint = splats.opacities < 0.2
-    found = every & faint
+    found = (np.abs((splats.means.astype(np.float64) - middle) @ axis) < reach) & (splats.opacities < 0.2)
     found[solid[flat]] = True
     return Ground(splats=found, normal=side_up * axis)
 

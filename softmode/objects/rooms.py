@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from softmode.splats.components import label_components
-from softmode.splats.splats import Splats, rotations_from_quats
+from softmode.splats.components import label_components, size_of
+from softmode.splats.splats import Splats
 
 Array = NDArray[np.float64]
 
@@ -17,12 +17,6 @@ ALIKE = 0.3
 """Size of such a thing over that of the object."""
 WALLS, INSIDE = 0.45, 0.15
 """Share of the outline along which walls stand, and share of the splats between them, from which on it is a room."""
-
-
-def size_of(part: Splats) -> float:
-    """Return the diagonal of the box around a part, but for its outermost splats."""
-    low, high = part.bounds(quantile=0.01)
-    return float(np.linalg.norm(high - low))
 
 
 def crop_of(part: Splats) -> str:
@@ -57,8 +51,7 @@ def _inside_of_walls(part: Splats) -> Splats | None:
     if solid.count < 500:
         return None
     x = solid.means.astype(np.float64)
-    thin = solid.scales.argmin(axis=1)
-    upright = np.abs(rotations_from_quats(solid.quats)[np.arange(len(x)), 2, thin]) < 0.3
+    upright = np.abs(solid.discs()[0][:, 2]) < 0.3
     low, high = np.quantile(x, [0.01, 0.99], axis=0)
     plan = x[:, :2][((x > low) & (x < high))[:, :2].all(axis=1)]
     x_edge, y_edge, z_edge = high - low
@@ -68,10 +61,8 @@ def _inside_of_walls(part: Splats) -> Splats | None:
     depth = -(x[:, :2] @ hull.equations[:, :2].T + hull.equations[:, 2]).max(axis=1)
     wide, height = float(np.sqrt(hull.volume)), (x[:, 2] - low[2]) / (high[2] - low[2])
     way = x[:, :2] - 0.5 * (low + high)[:2]
-    sector = np.floor((np.arctan2(way[:, 1], way[:, 0]) / (2.0 * np.pi) + 0.5) * 35.999).astype(int)
-    wall = upright & (depth < 0.05 * wide) & (height >= 0.0) & (height < 1.0)
-    held = np.zeros((36, 10), dtype=bool)
-    held[sector[wall], (10.0 * height[wall]).astype(int)] = True
+    around, wall = np.arctan2(way[:, 1], way[:, 0]), upright & (depth < 0.05 * wide)
+    held = np.histogram2d(around[wall], height[wall], (36, 10), ((-np.pi, np.pi), (0.0, 1.0)))[0] > 0
     inside = (depth > 0.1 * wide) & (height > 0.04) & (height < 0.7)
     if (held.mean(axis=1) >= 0.6).mean() < WALLS or inside.mean() < INSIDE:
         return None

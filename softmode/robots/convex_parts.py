@@ -26,16 +26,16 @@ def cut_meshes(spec: Any, model: Any, geoms: list[int]) -> list[str]:
         geoms: The shapes.
     """
     notes = []
-    meshes = [geom for geom in geoms if model.geom_dataid[geom] >= 0]
-    for geom, old in [(geom, _given(spec, model, geom)) for geom in meshes]:
+    meshes = {geom: model.body(int(model.geom_bodyid[geom])) for geom in geoms if model.geom_dataid[geom] >= 0}
+    given = [spec.body(link.name).geoms[geom - int(link.geomadr[0])] for geom, link in meshes.items()]
+    for (geom, link), old in zip(meshes.items(), given, strict=True):
         slabs = _slabs(model, int(model.geom_dataid[geom]))
         if not slabs:
             continue
-        link = int(model.geom_bodyid[geom])
-        body = spec.body(model.body(link).name)
+        body = spec.body(link.name)
         if not body.explicitinertial:
-            body.mass, body.inertia = model.body_mass[link], model.body_inertia[link]
-            body.ipos, body.iquat, body.explicitinertial = model.body_ipos[link], model.body_iquat[link], True
+            body.mass, body.inertia = link.mass[0], link.inertia
+            body.ipos, body.iquat, body.explicitinertial = link.ipos, link.iquat, True
         for k, points in enumerate(slabs):
             mesh = spec.add_mesh(name=f"{body.name}_{geom}_{k}", uservert=points.ravel().tolist())
             copied = {name: getattr(old, name) for name in ("contype", "conaffinity", "friction", "group", "rgba")}
@@ -49,10 +49,18 @@ def cut_meshes(spec: Any, model: Any, geoms: list[int]) -> list[str]:
     return notes
 
 
-def _given(spec: Any, model: Any, geom: int) -> Any:
-    """Return a shape's specification."""
-    link = model.body(int(model.geom_bodyid[geom]))
-    return spec.body(link.name).geoms[geom - int(link.geomadr[0])]
+def edge_ends(corners: Array) -> Array:
+    """Return both ends of the edges of triangles (F, 3, 3), one after the other, shape (6 F, 3)."""
+    return corners[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 3)
+
+
+def slab_corners(ends: Array, axis: int, low: float, high: float) -> Array:
+    """Return the corners of what lies of a surface between two planes across an axis, by the ends of its edges."""
+    first, last = ends.reshape(-1, 2, 3).swapaxes(0, 1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = (np.array([[low], [high]]) - first[:, axis]) / (last - first)[:, axis]
+    points = first + np.nan_to_num(np.clip(share, 0.0, 1.0))[..., None] * (last - first)
+    return points[(points[..., axis] >= low - 1e-9) & (points[..., axis] <= high + 1e-9)]
 
 
 def _slabs(model: Any, mesh: int) -> list[Array]:
@@ -60,19 +68,13 @@ def _slabs(model: Any, mesh: int) -> list[Array]:
     start, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
     points = np.asarray(model.mesh_vert[start : start + count], float)
     first, faces = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
-    corners = points[np.asarray(model.mesh_face[first : first + faces])]
-    a, b = corners.reshape(-1, 3), np.roll(corners, -1, axis=1).reshape(-1, 3)
+    edges = edge_ends(points[np.asarray(model.mesh_face[first : first + faces])])
     k = int(np.ptp(points, axis=0).argmax())
     ends = np.linspace(points[:, k].min(), points[:, k].max(), _SLABS + 1)
     found, volume = [], 0.0
     for low, high in itertools.pairwise(ends):
-        part = [points[(points[:, k] >= low) & (points[:, k] <= high)]]
-        for plane in (low, high):
-            crossing = (a[:, k] - plane) * (b[:, k] - plane) < 0.0
-            share = (plane - a[crossing, k]) / (b[crossing, k] - a[crossing, k])
-            part.append(a[crossing] + share[:, None] * (b[crossing] - a[crossing]))
         try:
-            hull = ConvexHull(np.concatenate(part))
+            hull = ConvexHull(slab_corners(edges, k, low, high))
         except (QhullError, ValueError):
             continue  # a slab that is flat, or empty
         found.append(hull.points[hull.vertices])

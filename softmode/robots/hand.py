@@ -99,7 +99,7 @@ def _found(robot: Compiled, drives: Sequence[JointDrive | None]) -> tuple[str, s
         depth[b] = depth[int(model.body_parentid[b])] + int(model.body_jntnum[b])
     last = max(range(1, model.nbody), key=lambda b: depth[b])
     # A finger is no end effector: the link from which it and others stand out is.
-    for palm in _above(model, last):
+    for palm in above(model, last):
         joints = _limited(robot, drives, palm)
         longest = max((depth[b] - depth[palm] for b in robot.behind(palm)), default=0)
         fingers = {branch(model, palm, j) for j in joints}
@@ -285,7 +285,7 @@ def _limited(robot: Compiled, drives: Sequence[JointDrive | None], link: int) ->
     return found
 
 
-def _above(model: Any, link: int) -> list[int]:
+def above(model: Any, link: int) -> list[int]:
     """Return the links between a link and the world, nearest first."""
     found = []
     while (link := int(model.body_parentid[link])) > 0:

@@ -15,8 +15,9 @@ from softmode.checks import require_fields
 from softmode.errors import ConfigError
 from softmode.robots.arm import ArmDescription
 from softmode.robots.arm_shapes import finger_parts, hand_parts
+from softmode.robots.convex_parts import edge_ends, slab_corners
 from softmode.robots.description import RobotDescription, RobotGripper, ToolPose, compiled
-from softmode.robots.hand import colliding, geom_corners, in_world, opposed, settled, side_of, surface_corners
+from softmode.robots.hand import above, colliding, geom_corners, in_world, opposed, settled, side_of, surface_corners
 
 Array = NDArray[np.float64]
 
@@ -117,19 +118,13 @@ def gap_of(robot: RobotDescription, jaw: ParallelJaw, opening: float) -> float:
         jaw: Its fingers.
         opening: 0 is closed, 1 is open.
     """
-    model = robot.model
-    data = _kinematics(robot, model, opening)
-    link = model.body(robot.end_effector).id
-    mount = data.xmat[link].reshape(3, 3)
-    turn = mount @ (Rotation.from_quat(robot.tool[3:]) * Rotation.from_quat(jaw.frame[3:])).as_matrix()
+    data = _kinematics(robot, opening)
+    tool, origin = _tool(robot, data)
+    turn = (tool * Rotation.from_quat(jaw.frame[3:])).as_matrix()
     if jaw.follow:
-        inside = np.array(robot.tool[:3]) + Rotation.from_quat(robot.tool[3:]).apply(jaw.frame[:3])
-        place = (data.xpos[link] + mount @ inside) @ turn
+        place = (origin + tool.apply(jaw.frame[:3])) @ turn
         return _one_gap(robot, data, turn, float(place[2]) - 0.5 * jaw.pad_length)
-    y, z = turn[:, 1], turn[:, 2]
-    left, right = (_pad_corners(model, data, side, z) @ y for side in _fingers(robot, model))
-    # The closing axis may point from either finger to the other.
-    return float(max(left.min() - right.max(), right.min() - left.max()))
+    return _apart(*(_pad_corners(robot.model, data, side, turn[:, 2]) @ turn[:, 1] for side in _fingers(robot)))
 
 
 def dry_friction_of(robot: RobotDescription) -> float:
@@ -138,9 +133,8 @@ def dry_friction_of(robot: RobotDescription) -> float:
     Args:
         robot: A robot with a gripper.
     """
-    model = robot.model
-    closed, wide = (_kinematics(robot, model, opening).qpos for opening in (0.0, 1.0))
-    return float(np.abs(wide - closed) @ model.dof_frictionloss)
+    closed, wide = (_kinematics(robot, opening).qpos for opening in (0.0, 1.0))
+    return float(np.abs(wide - closed) @ robot.model.dof_frictionloss)
 
 
 def measured(robot: RobotDescription) -> tuple[RobotDescription, ParallelJaw]:
@@ -149,9 +143,8 @@ def measured(robot: RobotDescription) -> tuple[RobotDescription, ParallelJaw]:
     Raises:
         ConfigError: If the robot has no two fingers that close on each other, nor one that closes on a fixed one.
     """
-    model = robot.model
-    sides = _fingers(robot, model)
-    if int(model.body_parentid[sides[0][0]]) in sides[1]:
+    sides = _fingers(robot)
+    if int(robot.model.body_parentid[sides[0][0]]) in sides[1]:
         return _one_jaw(robot, sides)
     return robot, _two_fingers(robot, sides)
 
@@ -161,26 +154,20 @@ def _edges(mjcf: str, links: tuple[int, ...]) -> dict[int, Array]:
     """Return both ends of the edges of the hulls of shapes of links, in their frames, (2 E, 3) [m]."""
     model = compiled(mjcf)
     hulls = {geom: ConvexHull(geom_corners(model, geom)) for geom in colliding(model, links)}
-    return {geom: hull.points[hull.simplices[:, [0, 1, 1, 2, 2, 0]]].reshape(-1, 3) for geom, hull in hulls.items()}
+    return {geom: edge_ends(hull.points[hull.simplices]) for geom, hull in hulls.items()}
 
 
-def _within(ends: Array, low: float, high: float) -> Array:
-    """Return the corners of what lies of hulls between two heights, by the ends of their edges."""
-    first, last = ends.reshape(-1, 2, 3).swapaxes(0, 1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        share = (np.array([[low], [high]]) - first[:, 2]) / (last - first)[:, 2]
-    points = first + np.nan_to_num(np.clip(share, 0.0, 1.0))[..., None] * (last - first)
-    return points[(points[..., 2] >= low - 1e-9) & (points[..., 2] <= high + 1e-9)]
+def _apart(one: Array, other: Array) -> float:
+    """Return the gap between two sets of coordinates along an axis that may point from either to the other."""
+    return float(max(one.min() - other.max(), other.min() - one.max()))
 
 
 def _one_gap(robot: RobotDescription, data: Any, turn: Array, low: float, high: float = np.inf) -> float:
     """Return the gap between a jaw and the fixed one, moving less fixed along y of a frame, in a slab of z [m]."""
-    sides = _fingers(robot, robot.model)
-    jaw, fixed = (_within(in_world(data, _edges(robot.mjcf, tuple(side))) @ turn, low, high)[:, 1] for side in sides)
-    if not len(jaw) or not len(fixed):
-        return -np.inf
-    # y may point from either one to the other
-    return float(max(jaw.min() - fixed.max(), fixed.min() - jaw.max()))
+    sides = _fingers(robot)
+    ends = [in_world(data, _edges(robot.mjcf, tuple(side))) @ turn for side in sides]
+    jaw, fixed = (slab_corners(side, 2, low, high)[:, 1] for side in ends)
+    return _apart(jaw, fixed) if len(jaw) and len(fixed) else -np.inf
 
 
 def _one_jaw(robot: RobotDescription, sides: tuple[list[int], list[int]]) -> tuple[RobotDescription, ParallelJaw]:
@@ -189,18 +176,13 @@ def _one_jaw(robot: RobotDescription, sides: tuple[list[int], list[int]]) -> tup
     assert gripper is not None
     j = int(model.body_jntadr[sides[0][0]])
     openings = np.linspace(0.0, 1.0, 41)
-    poses = [_kinematics(robot, model, s) for s in openings]
+    poses = [_kinematics(robot, s) for s in openings]
     closed, axis = poses[0], poses[0].xaxis[j]
-    mount = closed.xmat[model.body(robot.end_effector).id].reshape(3, 3)
 
     def points(data: Any, k: int) -> Array:
         return in_world(data, _edges(robot.mjcf, tuple(sides[k])))
 
-    along = points(closed, 0).mean(0) - closed.xanchor[j]
-    along = mount.T @ (along - axis * (along @ axis))
-    k = int(np.abs(along).argmax())
-    z = mount[:, k] * np.sign(along[k])
-    z = (z - axis * (z @ axis)) / np.linalg.norm(z - axis * (z @ axis))
+    z = _out(robot, closed, points(closed, 0).mean(0) - closed.xanchor[j], axis)
     y = axis if model.jnt_type[j] == _SLIDE else np.cross(axis, z)
     y = y * np.sign((points(poses[5], 0).mean(0) - points(closed, 0).mean(0)) @ y)
     turn = np.column_stack([np.cross(y, z), y, z])
@@ -215,16 +197,14 @@ def _one_jaw(robot: RobotDescription, sides: tuple[list[int], list[int]]) -> tup
             hint="give its links collision shapes that leave the space between the jaws free, such as boxes",
         )
     first = int(np.flatnonzero(gaps[: last + 1] <= 0.0)[-1]) if gaps[0] < 0.0 else 0
-    zero = (
-        np.interp(0.0, gaps[first : first + 2], openings[first : first + 2]) if gaps[first] < 0.0 else openings[first]
-    )
+    zero = np.interp(0.0, gaps[first : first + 2], openings[first : first + 2])
     ends = np.array([gripper.closed, gripper.open])
     ends = ends[0] + np.outer([zero, openings[last]], ends[1] - ends[0])
     jaws = RobotGripper(joints=gripper.joints, closed=tuple(ends[0].tolist()), open=tuple(ends[1].tolist()))
     at_usual = min(_USUAL, float(gaps[last]))
     usual = poses[int(np.searchsorted(gaps[: last + 1], at_usual))]
     moving = points(usual, 0) @ turn
-    tips = [_within(side, tip - _JAW, np.inf) for side in (moving, fixed)]
+    tips = [slab_corners(side, 2, tip - _JAW, np.inf) for side in (moving, fixed)]
     low, high = np.max([pad.min(0) for pad in tips], axis=0), np.min([pad.max(0) for pad in tips], axis=0)
     depth = np.arange(_JAW, tip - float(closed.xanchor[j] @ z), 0.005)
     free = [_one_gap(robot, usual, turn, tip - h - 0.0025, tip - h + 0.0025) > _DEEP * at_usual for h in depth]
@@ -240,7 +220,7 @@ def _one_jaw(robot: RobotDescription, sides: tuple[list[int], list[int]]) -> tup
         tip=float(beyond),
         reach=float(beyond - 0.5 * _JAW + (depth[free.index(False)] if False in free else depth[-1])),
         palm=(0.5 * width, 0.5 * float(gaps[last])),
-        friction=float(model.geom_friction[[geom for side in sides for geom in colliding(model, side)], 0].mean()),
+        friction=_friction(model, sides),
         frame=_in_tool(robot, closed, turn, middle),
         follow=0.5,
     )
@@ -250,26 +230,17 @@ def _one_jaw(robot: RobotDescription, sides: tuple[list[int], list[int]]) -> tup
 def _two_fingers(robot: RobotDescription, sides: tuple[list[int], list[int]]) -> ParallelJaw:
     """Measure two fingers that move."""
     model = robot.model
-    hand = [model.body(name).id for name in robot.hand_links]
-    hand = [link for link in hand if link not in sides[0] + sides[1]]
-    closed, wide = (_kinematics(robot, model, opening) for opening in (0.0, 1.0))
-    moved = [
-        surface_corners(model, wide, side).mean(0) - surface_corners(model, closed, side).mean(0) for side in sides
-    ]
+    hand = [link for name in robot.hand_links if (link := model.body(name).id) not in sides[0] + sides[1]]
+    closed, wide = (_kinematics(robot, opening) for opening in (0.0, 1.0))
+    fingers, shut = ([surface_corners(model, data, side) for side in sides] for data in (wide, closed))
+    moved = [ahead.mean(0) - behind.mean(0) for ahead, behind in zip(fingers, shut, strict=True)]
     axis = moved[0] - moved[1]
     y = axis / max(float(np.linalg.norm(axis)), 1e-12)
-    mount = wide.xmat[model.body(robot.end_effector).id].reshape(3, 3)
-    fingers = [surface_corners(model, wide, side) for side in sides]
-    base = surface_corners(model, wide, hand) if hand else np.empty((0, 3))
+    base = surface_corners(model, wide, hand)
     if not len(base):
         base = wide.xpos[[model.body_parentid[sides[0][0]]]]
-    out = np.concatenate(fingers).mean(0) - base.mean(0)
-    # The fingers stand out along an axis of the link that carries them.
-    along = mount.T @ (out - y * (out @ y))
-    k = int(np.abs(along).argmax())
-    z = mount[:, k] * np.sign(along[k])
-    z = z - y * (z @ y)
-    turn = np.column_stack([np.cross(y, z / np.linalg.norm(z)), y, z / np.linalg.norm(z)])
+    z = _out(robot, wide, np.concatenate(fingers).mean(0) - base.mean(0), y)
+    turn = np.column_stack([np.cross(y, z), y, z])
     left, right = (_pad_corners(model, wide, side, turn[:, 2]) @ turn for side in sides)
     face = np.array([left[:, 1].min(), right[:, 1].max()])
     opening = float(face[0] - face[1])
@@ -280,13 +251,12 @@ def _two_fingers(robot: RobotDescription, sides: tuple[list[int], list[int]]) ->
     low = np.max([pad.min(0) for pad in pads], axis=0)
     high = np.min([pad.max(0) for pad in pads], axis=0)
     # The fingers of linkages come out as they close: the table is what they must not reach then.
-    poses = (wide, _kinematics(robot, model, min(_USUAL / opening, 1.0)))
+    poses = (wide, _kinematics(robot, min(_USUAL / opening, 1.0)))
     tips = max(min(float((surface_corners(model, pose, side) @ turn[:, 2]).max()) for side in sides) for pose in poses)
     whole = fingers[0] @ turn
     beside = whole[whole[:, 2] >= min(low[2], high[2]) - 1e-9]
     base = base @ turn
     middle = np.array([0.5 * (low[0] + high[0]), 0.5 * (face[0] + face[1]), 0.5 * (low[2] + high[2])])
-    faces = [geom for side in sides for geom in colliding(model, side)]
     pad_width, pad_length = (max(float(high[j] - low[j]), _FACE) for j in (0, 2))
     return ParallelJaw(
         opening=opening,
@@ -297,19 +267,39 @@ def _two_fingers(robot: RobotDescription, sides: tuple[list[int], list[int]]) ->
         tip=float(tips - middle[2]),
         reach=float(tips - base[:, 2].max()),
         palm=(max(0.5 * float(np.ptp(base[:, 0])), 0.01), max(0.5 * float(np.ptp(base[:, 1])), 0.01)),
-        friction=float(model.geom_friction[faces, 0].mean()),
+        friction=_friction(model, sides),
         frame=_in_tool(robot, wide, turn, middle),
     )
 
 
+def _friction(model: Any, sides: tuple[list[int], list[int]]) -> float:
+    """Return the mean coefficient of what touches of both fingers."""
+    return float(model.geom_friction[colliding(model, sides[0] + sides[1]), 0].mean())
+
+
+def _out(robot: RobotDescription, data: Any, towards: Array, axis: Array) -> Array:
+    """Return the unit vector across an axis along which fingers stand out: an axis of the link that carries them."""
+    mount = data.xmat[robot.model.body(robot.end_effector).id].reshape(3, 3)
+    along = mount.T @ (towards - axis * (towards @ axis))
+    k = int(np.abs(along).argmax())
+    z = mount[:, k] * np.sign(along[k])
+    z = z - axis * (z @ axis)
+    return z / np.linalg.norm(z)
+
+
+def _tool(robot: RobotDescription, data: Any) -> tuple[Rotation, Array]:
+    """Return how the tool is turned in the world, and its origin there [m]."""
+    link = robot.model.body(robot.end_effector).id
+    mount = Rotation.from_matrix(data.xmat[link].reshape(3, 3))
+    return mount * Rotation.from_quat(robot.tool[3:]), data.xpos[link] + mount.apply(robot.tool[:3])
+
+
 def _in_tool(robot: RobotDescription, data: Any, turn: Array, middle: Array) -> ToolPose:
     """Return the pose of a frame in that of the tool, by its axes in the world and its origin along them [m]."""
-    link = robot.model.body(robot.end_effector).id
-    mount = data.xmat[link].reshape(3, 3)
-    tool = Rotation.from_matrix(mount) * Rotation.from_quat(robot.tool[3:])
-    x, y, z = tool.inv().apply(turn @ middle - data.xpos[link] - mount @ np.array(robot.tool[:3]))
-    a, b, c, d = (tool.inv() * Rotation.from_matrix(turn)).as_quat()
-    return (float(x), float(y), float(z), float(a), float(b), float(c), float(d))
+    tool, origin = _tool(robot, data)
+    x, y, z = tool.inv().apply(turn @ middle - origin).tolist()
+    a, b, c, d = (tool.inv() * Rotation.from_matrix(turn)).as_quat().tolist()
+    return x, y, z, a, b, c, d
 
 
 def _pad_corners(model: Any, data: Any, side: list[int], out: Array) -> Array:
@@ -331,20 +321,16 @@ def _pad_corners(model: Any, data: Any, side: list[int], out: Array) -> Array:
 _HINT = "give ParallelJaw(opening=..., ...) yourself; tasks need two fingers, or one that closes on a fixed one"
 
 
-def _fingers(robot: RobotDescription, model: Any) -> tuple[list[int], list[int]]:
+def _fingers(robot: RobotDescription) -> tuple[list[int], list[int]]:
     """Return the links of both fingers: the driven ones and all behind them."""
-    joints = robot.gripper.joints if robot.gripper else ()
+    model, joints = robot.model, robot.gripper.joints if robot.gripper else ()
     driven = {model.body(robot.joint_links[robot.joint_names.index(name)]).id for name in joints}
-    roots = [link for link in sorted(driven) if not _above(model, link) & driven]
-    sides: list[set[int]] = []
-    for root in roots:
-        palm = int(model.body_parentid[root])
-        own = {b for b in range(1, model.nbody) if root in {b, *_above(model, b)}}
-        # A link that a loop ties to the driven one belongs to the finger: the pads of linkages hang there.
-        sides.append(own | set(side_of(model, palm, root)))
+    roots = [link for link in sorted(driven) if driven.isdisjoint(above(model, link))]
+    # A link that a loop ties to the driven one belongs to the finger: the pads of linkages hang there.
+    sides = [set(side_of(model, int(model.body_parentid[root]), root)) for root in roots]
     leaders = {tie.joint: tie.leader for tie in robot.ties}
     if len(sides) > 2 and len({leaders.get(name, name) for name in joints}) == 1:
-        sides = opposed(_kinematics(robot, model, 0.0), _kinematics(robot, model, 1.0), sides)
+        sides = opposed(_kinematics(robot, 0.0), _kinematics(robot, 1.0), sides)
     if len(sides) == 1:  # what is fixed to the palm is the other finger
         rigid = model.body_weldid == model.body_weldid[model.body_parentid[roots[0]]]
         sides.append({b for b in range(1, model.nbody) if rigid[b]})
@@ -360,20 +346,11 @@ def finger_names(robot: RobotDescription) -> tuple[tuple[str, ...], tuple[str, .
     Raises:
         ConfigError: If the robot has no two driven fingers.
     """
-    model = robot.model
-    first, second = _fingers(robot, model)
-    return tuple(model.body(b).name for b in first), tuple(model.body(b).name for b in second)
+    first, second = (tuple(robot.model.body(b).name for b in side) for side in _fingers(robot))
+    return first, second
 
 
-def _above(model: Any, link: int) -> set[int]:
-    """Return all links between a link and the world."""
-    found = set()
-    while (link := int(model.body_parentid[link])) > 0:
-        found.add(link)
-    return found
-
-
-def _kinematics(robot: RobotDescription, model: Any, opening: float) -> Any:
+def _kinematics(robot: RobotDescription, opening: float) -> Any:
     """Return where everything is with the gripper at an opening."""
     passive = [robot.joint_names.index(name) for name in robot.passive_joints]
-    return settled(model, model.qpos0 + robot.with_opening(opening), passive)
+    return settled(robot.model, robot.model.qpos0 + robot.with_opening(opening), passive)

@@ -282,7 +282,7 @@ def place_robot(
     other = (*jaw.frame[:3], *half.as_quat().tolist())
     jaws = [jaw, replace(jaw, frame=other, follow=-jaw.follow)]
     bases = [[tuple(map(float, base))]] if base is not None else [_bases(chain, over, up) for up in _HEIGHTS]
-    best: tuple[float, ParallelJaw, Any, Array, list[float]] | None = None
+    best: list[tuple[float, ParallelJaw, Any, Array, float, Array]] = []
     search = _Search()
     for share, every in itertools.product(_SHARES, bases):
         home = np.array(home_position, float)
@@ -293,30 +293,27 @@ def place_robot(
         points = np.concatenate([home[None], places, np.reshape(np.array(also, float), (-1, 3))])
         far = np.linalg.norm(points[:, None] - _shoulders(chain, every), axis=2).max(axis=0)
         some = [one for one, distance in zip(every, far, strict=True) if distance < chain.reach + _NEAR]
-        found = [_placed(robot, one, home_opening, some, points, search) for one in jaws]
-        found = [one for one in found if one is not None]
-        if found:
-            _, chosen, placed, q = min(found, key=lambda one: one[0])
-            best = share, chosen, placed, q, home.tolist()
-        if found or search.left <= 0:
+        tried = [_placed(robot, one, home_opening, some, points, search) for one in jaws]
+        best = [(*one, share, home) for one in tried if one is not None]
+        if best or search.left <= 0:
             break
-    if best is None:
+    if not best:
         spent = f", in the {_POSES} poses that are tried" if search.left <= 0 else ""
         raise ConfigError(
             f"robot {robot.name!r}, whose tool reaches {chain.reach:.2f} m, finds no place from which it points down "
             f"at {tuple(home_position)} m, turned by {_YAW} rad to either side, and around {tuple(over)} m{spent}",
             hint="use a larger robot, a lower home_position, or name its tool: load(..., end_effector=, tool_offset=)",
         )
-    share, jaw, placed, q, home_position = best
+    _, jaw, placed, q, share, home = min(best, key=lambda one: one[0])
     gaps = np.maximum.accumulate([gap_of(robot, jaw, s) for s in np.linspace(0.0, 1.0, _OPENINGS)])
     gaps = np.maximum(gaps, 0.0) + 1.0e-7 * np.arange(_OPENINGS)  # ascending
     jaw = replace(jaw, opening=float(gaps[-1]))
     opening = min(home_opening, jaw.opening)
     fraction = float(np.interp(opening, gaps, np.linspace(0.0, 1.0, _OPENINGS)))
-    home = robot.home_joint_q
-    home[list(chain.joints)] = q
-    home = _closed_loops(robot, robot.with_opening(fraction, home.tolist()))
-    robot = replace(robot, home=tuple(home.tolist()))
+    pose = robot.home_joint_q
+    pose[list(chain.joints)] = q
+    pose = _closed_loops(robot, robot.with_opening(fraction, pose.tolist()))
+    robot = replace(robot, home=tuple(pose.tolist()))
     travel = 0.5 * float(gaps[-1] - gaps[0])
     friction = 0.5 * dry_friction_of(robot) / travel
     robot, force, stiffness = _with_grip(_steady(robot), travel, friction, grip_force, grip_way)
@@ -324,7 +321,7 @@ def place_robot(
         robot=robot,
         base=placed,
         jaw=jaw,
-        home_position=(float(home_position[0]), float(home_position[1]), float(home_position[2])),
+        home_position=(float(home[0]), float(home[1]), float(home[2])),
         home_opening=opening,
         gaps=tuple(gaps.tolist()),
         grip_force=force,

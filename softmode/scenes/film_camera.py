@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from softmode.scenes.host import host
 from softmode.scenes.meshes import SceneMesh, scene_meshes, scene_poses
 from softmode.splats.cameras.camera_options import CameraOptions
-from softmode.splats.cameras.mesh_raster import FilmLook, MeshRaster, TriangleMeshes
+from softmode.splats.cameras.mesh_raster import MeshRaster, TriangleMeshes
 from softmode.splats.raster.pinhole import PinholeCamera, Vector
 from softmode.splats.raster.rasterizer import RasterizerOptions, SplatArrays, SplatRasterizer, ViewArrays
 from softmode.splats.splats import Splats, rotations_from_quats
@@ -24,6 +24,8 @@ SEGMENTS = 48
 
 TABLE = "world/table"
 """Label of the shape that is shown as a table of wood."""
+WOOD = (0.70, 0.64, 0.57)
+"""Colour of its planks, sRGB."""
 MARKER_OPACITY = 0.6
 """Factor on the opacities of a marker's splats."""
 
@@ -41,7 +43,7 @@ class FilmCamera:
         marker: The splats that mark a place.
         cameras: The cameras, fixed in the world until `aim` moves one.
         options: Light and sky.
-        look: A second light, a table of wood and a room around all; None for none.
+        room: Whether a second light, a table of wood and a room around all are shown.
     """
 
     def __init__(
@@ -53,7 +55,7 @@ class FilmCamera:
         cameras: Sequence[PinholeCamera],
         *,
         options: CameraOptions | None = None,
-        look: FilmLook | None = None,
+        room: bool = False,
     ) -> None:
         """Upload the meshes and allocate the images."""
         self.cameras, self._objects, self._marker = tuple(cameras), objects, marker
@@ -64,11 +66,11 @@ class FilmCamera:
         self._matrices = np.stack([camera.world_to_camera for camera in per_world])
         width, height, views = cameras[0].width, cameras[0].height, len(per_world)
         size = (views, width, height)
-        meshes, starts, low, high = _triangles(model, state, look)
+        meshes, starts, low, high = _triangles(model, state, room)
         about = (0.5 * (low + high), 0.75 * float(np.linalg.norm(high - low)))
         self._boxes, self._starts = _boxes(meshes), starts
         light = options if options is not None else CameraOptions()
-        self._meshes = MeshRaster(meshes, starts, *about, *size, light=light, look=look, device=device)
+        self._meshes = MeshRaster(meshes, starts, *about, *size, light=light, room=room, device=device)
         self._splats = SplatRasterizer(objects.means.shape[1], *size, device=device)
         self._marks = None if marker is None else SplatRasterizer(marker.means.shape[1], *size, device=device)
         self._plate: SplatRasterizer | None = None
@@ -163,7 +165,7 @@ def _boxes(meshes: TriangleMeshes) -> dict[int, NDArray[np.float64]]:
 
 
 def _triangles(
-    model: newton.Model, state: newton.State, look: FilmLook | None
+    model: newton.Model, state: newton.State, room: bool
 ) -> tuple[TriangleMeshes, NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]]:
     """Return the meshes of a world, the first body of each world, and the box of what moves, or else of all [m]."""
     worlds = max(int(model.world_count), 1)
@@ -179,8 +181,8 @@ def _triangles(
     box = [part for mesh, part in zip(meshes, moved, strict=True) if mesh.body >= 0] or moved or [np.zeros((1, 3))]
     bodies = [mesh.body - int(starts[0]) if mesh.body >= 0 else -1 for mesh in meshes]
     sizes = [len(mesh.faces) for mesh in meshes]
-    wooden = [look is not None and mesh.label == TABLE for mesh in meshes]
-    tints = [look.table if look is not None and wood else m.color for m, wood in zip(meshes, wooden, strict=True)]
+    wooden = [room and mesh.label == TABLE for mesh in meshes]
+    tints = [WOOD if wood else mesh.color for mesh, wood in zip(meshes, wooden, strict=True)]
     triangles = TriangleMeshes(
         corners=np.concatenate([empty, *(mesh.vertices for mesh in meshes)]),
         normals=np.concatenate([empty, *(mesh.normals for mesh in meshes)]),

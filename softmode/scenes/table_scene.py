@@ -43,7 +43,6 @@ from softmode.scenes.recording import Recording
 from softmode.scenes.scene import cameras_by_size
 from softmode.splats.cameras.camera import CameraOptions, SplatCamera
 from softmode.splats.cameras.camera_randomization import CameraRandomization
-from softmode.splats.cameras.mesh_raster import FilmLook
 from softmode.splats.raster.pinhole import PinholeCamera
 from softmode.splats.splats import Splats
 
@@ -196,7 +195,7 @@ class TableScene:
             seen, columns = self.splats.arrays, self.splats.columns
             things = slice(0, columns[len(self.splats.indices) - 1].stop)
             goal = None if self.marker is None else columns_of(seen, columns[-1])
-            self.film = FilmCamera(self.model, self.state, columns_of(seen, things), goal, film, look=FilmLook())
+            self.film = FilmCamera(self.model, self.state, columns_of(seen, things), goal, film, room=True)
         self._graph: Recording | None = None
         self._camera_graphs: dict[tuple[int, int], Recording] = {}
         if self.occupancy.slots > 1:

@@ -11,10 +11,15 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from softmode.checks import require_number
-from softmode.splats.splats import Splats, rotations_from_quats
+from softmode.splats.splats import Splats
 
 DENSE = 20_000
 """Above so many splats a capture is thinned out before its splats are linked."""
+
+
+def size_of(splats: Splats) -> float:
+    """Return the diagonal of the box around splats, but for the outermost hundredth [m]."""
+    return float(np.linalg.norm(np.diff(splats.bounds(quantile=0.01), axis=0)))
 
 
 def split_components(
@@ -53,15 +58,14 @@ def label_components(
             farther apart than the fine ones of its rim.
     """
     if gap is None:
-        low, high = splats.bounds(quantile=0.01)
-        gap = max(0.015 * float(np.linalg.norm(high - low)), 1e-9)
+        gap = max(0.015 * size_of(splats), 1e-9)
     require_number("gap", gap, above=0.0, hint="Give a distance in the unit of the asset")
     solid = np.flatnonzero(splats.opacities >= min_opacity)
     if len(solid) == 0:
         return np.full(splats.count, -1, dtype=np.intp)
     points = splats.means[solid]
     if faces:
-        points = np.concatenate([points, _disc_points(splats, solid, gap)])
+        points = np.concatenate([points, _disc_points(splats.subset(solid), gap, 0.25 * size_of(splats))])
     tree, label = _chains(points, gap)
     distance, nearest = tree.query(splats.means)
     every = np.where(distance <= gap, label[nearest], -1)
@@ -93,16 +97,11 @@ def _chains(points: NDArray[Any], gap: float) -> tuple[KDTree, NDArray[np.intp]]
     return tree, label.astype(np.intp)
 
 
-def _disc_points(splats: Splats, solid: NDArray[np.intp], gap: float) -> NDArray[np.float32]:
-    """Return points on the discs of flat splats that are wider than half the gap."""
-    low, high = splats.bounds(quantile=0.01)
-    scales = np.sort(splats.scales, axis=1)
-    flat = (scales[:, 1] > 0.5 * gap) & (scales[:, 0] < 0.3 * scales[:, 1]) & (splats.opacities >= 0.5)
-    some = solid[(flat & (scales[:, 2] < 0.25 * np.linalg.norm(high - low)))[solid]]
-    order = np.argsort(-splats.scales[some], axis=1)[:, None, :2]
-    axes = np.take_along_axis(rotations_from_quats(splats.quats[some]), order, axis=2)
-    tangents = axes * np.take_along_axis(splats.scales[some], order[:, 0], axis=1)[:, None]
-    return disc_points(splats.means[some], tangents, gap)
+def _disc_points(splats: Splats, gap: float, widest: float) -> NDArray[np.float32]:
+    """Return points on the discs of flat splats that are wider than half the gap, and not haze wider than `widest`."""
+    thin, wide, long = np.sort(splats.scales, axis=1).T
+    flat = (wide > 0.5 * gap) & (thin < 0.3 * wide) & (splats.opacities >= 0.5) & (long < widest)
+    return disc_points(splats.means[flat], splats.discs()[1][flat], gap)
 
 
 def disc_points(means: NDArray[Any], tangents: NDArray[Any], gap: float) -> NDArray[np.float32]:

@@ -133,6 +133,17 @@ class Splats:
         frame = rotations_from_quats(self.quats)
         return np.einsum("nij,nj,nkj->nik", frame, self.scales.astype(np.float64) ** 2, frame)
 
+    def discs(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the thin axes, of either sign, and the others as long as their standard deviations [m].
+
+        Returns:
+            Unit vectors, shape (N, 3), and columns, the longest first, shape (N, 3, 2).
+        """
+        scales = self.scales.astype(np.float64)
+        order = np.argsort(-scales, axis=1, kind="stable")
+        axes = np.take_along_axis(rotations_from_quats(self.quats), order[:, None], axis=2)
+        return axes[:, :, 2], axes[:, :, :2] * np.take_along_axis(scales, order[:, :2], axis=1)[:, None]
+
     def bounds(self, *, quantile: float = 0.0) -> NDArray[np.float64]:
         """Return the axis-aligned box of the centres [m], shape (2, 3).
 

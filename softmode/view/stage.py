@@ -78,8 +78,7 @@ class Stage:
         picture = self._session.splats()
         words = self._gaussians.pack(picture.means, picture.covariances)
         poses = self._session.poses()
-        touched = self._on_drag is not None
-        grips = self._surfaces()[self._grip_samples].astype(np.float32) if touched else None
+        grips = None if self._on_drag is None else self._surfaces()[self._grip_samples].astype(np.float32)
         with self._server.atomic():  # one message: splats never run ahead of the hand that holds them
             self._splats.buffer = words
             for body, frame in self._frames.items():

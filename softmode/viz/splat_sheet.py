@@ -14,6 +14,7 @@ from softmode.deformables.quadrature.occupancy import Occupancy, fill_splats
 from softmode.errors import AssetError
 from softmode.objects.config import ObjectConfig
 from softmode.objects.parts import Choice, choose_part
+from softmode.objects.rooms import crop_of
 from softmode.splats.raster.pinhole import PinholeCamera
 from softmode.splats.raster.rasterizer import SplatArrays, SplatRasterizer, ViewArrays
 from softmode.splats.splats import SH_DC, Splats
@@ -126,9 +127,8 @@ def _told(survey: SplatSurvey) -> list[str]:
     lines = [f"{splats.count} splats, {x:.3g} x {y:.3g} x {z:.3g} (unit of the file)", *candidate_lines(survey)]
     if fill is None:
         return [*lines, f"no solid: {survey.why}"]
-    low, high = survey.splats.subset(survey.kept).bounds(quantile=0.002)
-    box = " ".join(f"{value:.3g}" for value in (*low, *high))
-    return [*lines, f"taken: {np.count_nonzero(survey.kept)} splats", f"   --crop {box}"]
+    taken = f"taken: {np.count_nonzero(survey.kept)} splats"
+    return [*lines, taken, f"   --crop {crop_of(splats.subset(survey.kept))}"]
 
 
 def candidate_lines(survey: SplatSurvey) -> list[str]:

@@ -25,11 +25,14 @@ RED, BLUE = (0.8, 0.1, 0.1), (0.1, 0.1, 0.8)
 
 
 def test_painted_late_is_painted_at_once() -> None:
-    """Bit for bit the body that a build with the field gives, and softer; the density goes likewise."""
+    """Bit for bit the body that a build with the field gives, told of in stages, and softer; the density likewise."""
     quadrature = quadrature_from_box(SIZE, point_count=500, surface_count=60)
     free = build_body(quadrature, OPTIONS, name="bar", progress=False)
     field = np.where(quadrature.points[:, 0] > 0.0, 0.1, 1.0)
-    told = build_body(quadrature, OPTIONS, name="bar", stiffness_scale=field, progress=False)
+    shares: list[float] = []
+    options = {"stiffness_scale": field, "progress": lambda stage, share: shares.append(share)}
+    told = build_body(quadrature, OPTIONS, name="bar", **options)
+    assert len(shares) > 3 and shares == sorted(shares) and shares[-1] == 1.0
     late = paint(free, stiffness_scale=lambda X: np.where(X[:, 0] > 0.0, 0.1, 1.0))
     assert late.fingerprint == told.fingerprint and np.array_equal(late.transform, told.transform)
     heavy = paint(late, density_scale=np.where(field < 1.0, 3.0, 1.0))

@@ -162,8 +162,9 @@ def _build(
     with under_way(f"building the body of {name}"), _reporter(progress, name) as report:
 
         def stage(label: str) -> None:
-            seconds[label] = time.perf_counter() - start - sum(seconds.values())
-            report(label, _PROGRESS[label])
+            # Where two bases are compared, stages come again: their seconds add up, and the bar does not go back.
+            seconds[label] = seconds.get(label, 0.0) + time.perf_counter() - start - sum(seconds.values())
+            report(label, max(_PROGRESS[done] for done in seconds))
 
         basis = make_body_basis(
             Domain(

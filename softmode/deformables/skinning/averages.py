@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
@@ -23,8 +22,6 @@ splats there are averaged exactly: near gaps and corners, which functions go aro
 GRID_LIMIT = 2**24
 """Most nodes of a grid."""
 
-Told = Callable[[float], None]
-
 
 class Functions(Protocol):
     """Scalar functions of rest points; a `ReducedBody` is some."""
@@ -43,9 +40,7 @@ class Functions(Protocol):
         ...
 
 
-def average_basis(
-    functions: Functions, means: ArrayLike, covariances: ArrayLike, *, progress: Told | None = None
-) -> tuple[Array, Array]:
+def average_basis(functions: Functions, means: ArrayLike, covariances: ArrayLike) -> tuple[Array, Array]:
     """Return basis values and gradients averaged over each splat, for `SkinSplats`.
 
     A splat is as wide as the deformation varies where a basis is coarse or torn: the gradient at its centre then draws
@@ -62,7 +57,6 @@ def average_basis(
         functions: The body.
         means: Rest centres in the body frame [m], shape (N, 3).
         covariances: Rest covariances [m^2], shape (N, 3, 3).
-        progress: Told now and then which share is done.
 
     Returns:
         Values, shape (N, n), and gradients [1/m], shape (N, n, 3).
@@ -74,28 +68,24 @@ def average_basis(
     least = 1e-5 * max(float(np.ptp(x, axis=0).max()), float(np.sqrt(variance.max())))
     small = arms[:, 2] <= functions.narrow
     arms = np.maximum(arms, least)
-    tell = progress or (lambda share: None)
-    grid = _Grid(functions, x, arms, axes, small, tell) if len(x) >= MANY and functions.narrow > 0.0 else None
-    exact = np.ones(len(x), dtype=bool) if grid is None else grid.exact
+    grid = _Grid(functions, x, arms, axes, small) if len(x) >= MANY and functions.narrow > 0.0 else None
+    sources = [(functions, np.ones(len(x), bool))] if grid is None else [(functions, grid.exact), (grid, ~grid.exact)]
     parts: list[tuple[NDArray[np.intp], Array, Array]] = []
-    groups = [(kind, here) for kind in (small, ~small) for here in ((kind & exact), (kind & ~exact))]
-    done = 0
-    for kind, member in groups:
-        for rows in np.array_split(np.flatnonzero(member), 1 + int(member.sum()) // TOGETHER):
-            if not len(rows):
-                continue
-            source: Functions = functions if grid is None or exact[rows[0]] else grid
-            if kind is small:
-                parts.append((rows, *source.evaluate(x[rows])))
-            else:
-                parts.append((rows, *_differences(source, x[rows], arms[rows], axes[rows])))
-            done += len(rows)
-            tell(0.5 * (grid is not None) + (1.0 - 0.5 * (grid is not None)) * done / len(x))
+    for source, member in sources:
+        for rows in filter(len, _portions(np.flatnonzero(member & small))):
+            parts.append((rows, *source.evaluate(x[rows])))
+        for rows in filter(len, _portions(np.flatnonzero(member & ~small))):
+            parts.append((rows, *_differences(source, x[rows], arms[rows], axes[rows])))
     back = np.argsort(np.concatenate([rows for rows, _, _ in parts]))
     return np.concatenate([value for _, value, _ in parts])[back], np.concatenate([g for _, _, g in parts])[back]
 
 
-def _differences(functions: Functions, x: Array, arms: Array, axes: Array) -> tuple[Array, Array]:
+def _portions(rows: NDArray[Any]) -> list[NDArray[Any]]:
+    """Return rows in parts that are small enough."""
+    return np.array_split(rows, 1 + len(rows) // TOGETHER)
+
+
+def _differences(functions: Functions | _Grid, x: Array, arms: Array, axes: Array) -> tuple[Array, Array]:
     """Return averages over wide splats, from values at both ends of their arms."""
     value, gradient = np.zeros(()), np.zeros(())
     for i in range(3):
@@ -115,10 +105,9 @@ class _Grid:
         arms: Half-widths [m], shape (N, 3).
         axes: Axes of the splats, as columns, shape (N, 3, 3).
         small: Which splats are evaluated at their centres alone, shape (N,).
-        tell: Told which share of all is done, up to a half.
     """
 
-    def __init__(self, functions: Functions, x: Array, arms: Array, axes: Array, small: NDArray[np.bool_], tell: Told):
+    def __init__(self, functions: Functions, x: Array, arms: Array, axes: Array, small: NDArray[np.bool_]):
         """Evaluate the functions at the nodes, and find the splats for which that is not exact enough."""
         tips = np.concatenate([x + way * arms[:, i, None] * axes[:, :, i] for i in range(3) for way in (1.0, -1.0)])
         owner = np.tile(np.arange(len(x)), 6)
@@ -130,33 +119,26 @@ class _Grid:
         far = ((points < low - 0.1 * (high - low)) | (points > high + 0.1 * (high - low))).any(axis=1)
         self.exact[owner[far]] = True
         points, owner = points[~far], owner[~far]
-        self.spacing = SPACING * functions.narrow
         low, high = points.min(axis=0), points.max(axis=0)
-        self.spacing = max(self.spacing, float(np.prod(high - low) / GRID_LIMIT) ** (1.0 / 3.0))
+        self.spacing = max(SPACING * functions.narrow, float(np.prod(high - low) / GRID_LIMIT) ** (1.0 / 3.0))
         self.origin = low - 1.5 * self.spacing
-        self.shape = np.ceil((high - self.origin) / self.spacing).astype(int) + 3
-        cell = np.floor((points - self.origin) / self.spacing).astype(np.intp)
-        occupied = np.zeros(self.shape, dtype=bool)
-        occupied[tuple(cell.T)] = True
+        shape = np.ceil((high - self.origin) / self.spacing).astype(int) + 3
+        self.strides = np.array([shape[1] * shape[2], shape[2], 1])
+        key = np.floor((points - self.origin) / self.spacing).astype(np.intp) @ self.strides
+        occupied = np.zeros(shape, dtype=bool)
+        occupied.flat[key] = True
         # A cell's cubics reach one node before it and two behind.
         nodes: Any = ndimage.binary_dilation(occupied, np.ones((4, 4, 4)), origin=-1)
         self.number = np.full(nodes.size, -1, dtype=np.int32)
         place = np.flatnonzero(nodes)
         self.number[place] = np.arange(len(place))
         at = self.origin + self.spacing * np.stack(np.unravel_index(place, nodes.shape), axis=1)
-        parts = np.array_split(at, 1 + len(at) // TOGETHER)
-        tables = []
-        for k, part in enumerate(parts):
-            tables.append(functions.values(part).astype(np.float32))
-            tell(0.4 * (k + 1) / len(parts))
-        self.table = np.concatenate(tables)
-        key = np.ravel_multi_index(tuple(cell.T), nodes.shape)
+        self.table = np.concatenate([functions.values(part).astype(np.float32) for part in _portions(at)])
         _, first, back = np.unique(key, return_index=True, return_inverse=True)
         error = np.abs(self.values(points[first]) - functions.values(points[first]))
-        slope = float(np.sqrt(np.mean([np.square(self.evaluate(points[first[::8]])[1]).mean()])))
+        slope = np.sqrt(np.square(self.evaluate(points[first[::8]])[1]).mean())
         bad = error.max(axis=1) > TOLERANCE * self.spacing * slope
-        self.exact[owner[bad[back.ravel()]]] = True
-        tell(0.5)
+        self.exact[owner[bad[back]]] = True
 
     def values(self, points: Array) -> Array:
         """Return values (N, n) at points [m] (N, 3)."""
@@ -166,26 +148,18 @@ class _Grid:
         """Return values (N, n) and gradients [1/m] (N, n, 3) at points [m] (N, 3)."""
         return self._found(points, None), np.stack([self._found(points, d) for d in range(3)], axis=2)
 
-    @property
-    def narrow(self) -> float:
-        """Width over which they hardly bend [m]."""
-        return self.spacing / SPACING
-
     def _found(self, points: Array, along: int | None) -> Array:
         """Return values, or derivatives along an axis, by a sparse product with the nodes."""
         place = (points - self.origin) / self.spacing
         cell = np.floor(place).astype(np.intp)
         t = (place - cell)[:, :, None]
         cubic = np.array([[0, -0.5, 1, -0.5], [1, 0, -2.5, 1.5], [0, 0.5, 2, -1.5], [0, 0, -0.5, 0.5]])
-        power = np.concatenate([np.ones_like(t), t, t * t, t**3], axis=2)
-        weight = power @ cubic.T  # (N, axis, node)
+        weight = t ** np.arange(4) @ cubic.T  # (N, axis, node)
         if along is not None:
-            rising = np.concatenate([np.zeros_like(t), np.ones_like(t), 2.0 * t, 3.0 * t * t], axis=2)[:, along]
-            weight[:, along] = rising @ cubic.T / self.spacing
+            weight[:, along] = (np.arange(4) * t[:, along] ** [0, 0, 1, 2]) @ cubic.T / self.spacing
         data = np.einsum("ni,nj,nk->nijk", weight[:, 0], weight[:, 1], weight[:, 2]).astype(np.float32)
-        _, b, c = self.shape
-        i, j, k = (cell[:, d, None] + np.arange(-1, 3) for d in range(3))
-        index = (i[:, :, None, None] * b + j[:, None, :, None]) * c + k[:, None, None, :]
+        around = (np.indices((4, 4, 4)).reshape(3, 64).T - 1) @ self.strides
+        index = (cell @ self.strides)[:, None] + around
         rows = np.arange(0, data.size + 1, 64)
         matrix = sparse.csr_matrix((data.ravel(), self.number[index.ravel()], rows), (len(points), len(self.table)))
         return (matrix @ self.table).astype(np.float64)

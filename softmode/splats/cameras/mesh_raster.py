@@ -33,24 +33,6 @@ BANDS = 32
 """Threads of a triangle on CUDA."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class FilmLook:
-    """A second light, wood, and a room around all, for pictures that people look at."""
-
-    fill_direction: Vector = (0.55, -0.75, -0.45)
-    """Direction in which the second light travels; it casts no shadow."""
-    fill_color: Vector = (0.20, 0.22, 0.26)
-    """Its linear radiance."""
-    table: Vector = (0.70, 0.64, 0.57)
-    """Colour of the table's planks, sRGB."""
-    room: tuple[Vector, Vector] = ((-1.1, -1.6, -0.75), (3.0, 1.9, 1.9))
-    """Lowest and highest corner of the room [m]."""
-    wall: Vector = (0.70, 0.76, 0.80)
-    """Colour of its walls, sRGB."""
-    floor: Vector = (0.55, 0.46, 0.38)
-    """Colour of its floor, sRGB."""
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TriangleMeshes:
     """The triangles of one world, whose bodies every world has."""
@@ -88,7 +70,7 @@ class MeshRaster:
         width: Image width [px].
         height: Image height [px].
         light: Light and sky.
-        look: A second light and a room; None for none.
+        room: Whether there is a room around all, with a second light, in place of the sky.
         device: Warp device.
     """
 
@@ -103,7 +85,7 @@ class MeshRaster:
         height: int,
         *,
         light: CameraOptions,
-        look: FilmLook | None = None,
+        room: bool = False,
         device: wp.Device,
     ) -> None:
         """Upload the triangles and allocate the images."""
@@ -125,7 +107,7 @@ class MeshRaster:
         t.wooden = wp.array(meshes.wooden[order], dtype=wp.bool, device=device)
         t.body_start = wp.array(body_start, dtype=wp.int32, device=device)
         self._triangles = t
-        self._light = _light(light, look, center, radius, device)
+        self._light = _light(light, room, center, radius, device)
         self._shadows = light.shadows
         moved = (self._worlds, len(meshes.corners))
         self._corner, self._normal = (wp.zeros(moved, dtype=wp.vec3, device=device) for _ in range(2))
@@ -223,9 +205,7 @@ def _views(views: ViewArrays) -> Any:
     return seen
 
 
-def _light(
-    options: CameraOptions, look: FilmLook | None, center: NDArray[np.float64], radius: float, device: wp.Device
-) -> Any:
+def _light(options: CameraOptions, room: bool, center: NDArray[np.float64], radius: float, device: wp.Device) -> Any:
     """Return what the kernels know of the light, the map of shadows about a centre [m]."""
     frame = light_frame(options.light_direction)
     light = kernels.Light()
@@ -234,10 +214,7 @@ def _light(
     light.cell = 2.0 * radius / CELLS
     light.above, light.below = (wp.vec3(*radiance) for radiance in options.ambient)
     light.sun = wp.vec3(*options.light_color)
-    if look is not None:
-        light.fill_direction = wp.vec3(*light_frame(look.fill_direction)[2])
-        light.fill, light.wall, light.floor = (wp.vec3(*c) for c in (look.fill_color, look.wall, look.floor))
-        light.room_low, light.room_high = (wp.vec3(*corner) for corner in look.room)
+    light.room = room
     light.horizon, light.zenith = (wp.vec3(*color) for color in options.sky)
     light.encoded = encoded_light(device)
     return light

@@ -38,6 +38,16 @@ PLANK = wp.constant(wp.vec2(0.09, 0.60))
 GRAIN = wp.constant(0.004)
 """Width of the grain of wood [m]."""
 
+# The room in which films are shot: a second light, which casts no shadow, and walls around all.
+FILL_DIRECTION = wp.constant(wp.normalize(wp.vec3(0.55, -0.75, -0.45)))
+"""Direction in which the second light travels."""
+FILL = wp.constant(wp.vec3(0.20, 0.22, 0.26))
+"""Its linear radiance."""
+ROOM_LOW, ROOM_HIGH = wp.constant(wp.vec3(-1.1, -1.6, -0.75)), wp.constant(wp.vec3(3.0, 1.9, 1.9))
+"""Lowest and highest corner of the room [m]."""
+WALL, FLOOR = wp.constant(wp.vec3(0.70, 0.76, 0.80)), wp.constant(wp.vec3(0.55, 0.46, 0.38))
+"""Colours of its walls and its floor, sRGB."""
+
 layer = wp.types.vector(length=4, dtype=float)
 
 
@@ -66,12 +76,7 @@ class Light:
     above: wp.vec3  # linear ambient radiance
     below: wp.vec3
     sun: wp.vec3
-    fill_direction: wp.vec3  # in which the second light travels, which casts no shadow
-    fill: wp.vec3
-    room_low: wp.vec3  # lowest corner of the room around all [m]
-    room_high: wp.vec3  # highest; not above the lowest one for a sky
-    wall: wp.vec3  # sRGB
-    floor: wp.vec3  # sRGB
+    room: wp.bool  # whether there is a room, with its light, in place of the sky
     horizon: wp.vec3  # sRGB
     zenith: wp.vec3
     encoded: wp.array[float]  # (ENCODED + 1,) sRGB of linear light 0..1
@@ -290,13 +295,13 @@ def planks(x: float, y: float, footprint: float) -> float:
 
 
 @wp.func
-def room_color(light: Light, eye: wp.vec3, ray: wp.vec3, pixel: float) -> wp.vec3:
+def room_color(eye: wp.vec3, ray: wp.vec3, pixel: float) -> wp.vec3:
     """Return the colour of floor, wall or ceiling along a ray from within the room; corners are darker."""
     first = float(1.0e30)
     side = int(0)
     for axis in range(3):
         if ray[axis] != 0.0:
-            edge = wp.where(ray[axis] > 0.0, light.room_high[axis], light.room_low[axis])
+            edge = wp.where(ray[axis] > 0.0, ROOM_HIGH[axis], ROOM_LOW[axis])
             t = (edge - eye[axis]) / ray[axis]
             if t > 0.0 and t < first:
                 first = t
@@ -306,26 +311,26 @@ def room_color(light: Light, eye: wp.vec3, ray: wp.vec3, pixel: float) -> wp.vec
     nearest = float(1.0e30)  # other wall
     for axis in range(3):
         if axis != side:
-            nearest = wp.min(nearest, wp.min(p[axis] - light.room_low[axis], light.room_high[axis] - p[axis]))
+            nearest = wp.min(nearest, wp.min(p[axis] - ROOM_LOW[axis], ROOM_HIGH[axis] - p[axis]))
     corner = 1.0 - 0.28 * wp.exp(-nearest / 0.35)
     if side == 2 and ray[2] < 0.0:
         from_middle = wp.length(wp.vec2(p[0] - 0.35, p[1]))
         flat = footprint * wp.length(ray) / -ray[2]
-        return light.floor * (corner * planks(p[1], p[0], flat) * (0.72 + 0.28 * wp.clamp(from_middle, 0.0, 1.0)))
-    height = p[2] - light.room_low[2]
+        return FLOOR * (corner * planks(p[1], p[0], flat) * (0.72 + 0.28 * wp.clamp(from_middle, 0.0, 1.0)))
+    height = p[2] - ROOM_LOW[2]
     board = wp.clamp((0.10 - height) / (footprint + 0.002) + 0.5, 0.0, 1.0)
     tone = 0.84 + 0.16 * wp.clamp(height / 2.2, 0.0, 1.0)
     if side == 0:
         tone *= 0.94
-    wall = light.wall * (corner * tone)
+    wall = WALL * (corner * tone)
     return board * 0.93 * corner * wp.vec3(1.0, 1.0, 1.0) + (1.0 - board) * wall
 
 
 @wp.func
 def behind_all(light: Light, eye: wp.vec3, ray: wp.vec3, pixel: float) -> wp.vec3:
     """Return the colour of room or sky along a ray."""
-    if light.room_high[0] > light.room_low[0]:
-        return room_color(light, eye, ray, pixel)
+    if light.room:
+        return room_color(eye, ray, pixel)
     return sky_color(light.horizon, light.zenith, ray)
 
 
@@ -367,7 +372,8 @@ def shade(
         p = p0 + s * a + t * b + OFF * light.cell * n
         left = 1.0 - (1.0 - SHADOW_LIGHT) * shaded(light, shadow, world, p)
         received += toward * left * light.sun
-    received += wp.max(-wp.dot(n, light.fill_direction), 0.0) * light.fill
+    if light.room:
+        received += wp.max(-wp.dot(n, FILL_DIRECTION), 0.0) * FILL
     color = triangles.color[f]
     if triangles.wooden[f]:
         p = p0 + s * a + t * b
