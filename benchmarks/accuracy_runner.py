@@ -214,7 +214,7 @@ class Simulation:
                 for turn, motion in zip(turns, motions, strict=True)
             ]
             target = self.q.copy()
-            target[: self.driven] = self.body.driven_affine(turns, shifts)
+            target[: self.driven] = self.body.regions.driven_affine(turns, shifts)
             self.control.softmode.q_driven.assign(target)
         elif self.targets:
             positions = [clamp.motion.position(points, time) for points, clamp in self.targets]

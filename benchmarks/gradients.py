@@ -34,7 +34,9 @@ class Bar:
         world, builder = newton.ModelBuilder(), newton.ModelBuilder()
         material = Material(youngs_modulus=2.0e5, poissons_ratio=0.4, density=1000.0)
         index = add_reduced_body(world, body, material=material)
-        add_pins(world, index, body.points[body.points[:, 0] < body.bounds[0, 0] + 0.1], stiffness=2.0e3)
+        add_pins(
+            world, index, body.cubature.points[body.cubature.points[:, 0] < body.bounds[0, 0] + 0.1], stiffness=2.0e3
+        )
         register_custom_attributes(builder)
         builder.replicate(world, world_count)
         self.model: Any = builder.finalize(device=device)

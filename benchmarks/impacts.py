@@ -83,7 +83,7 @@ def path(integrator: Integrator, pinned: bool, dt: float, duration: float) -> np
         spin = (0.0, 0.0, 0.0) if pinned else (0.0, 3.0, 5.0)
         index = add_reduced_body(world, body, material=material, angular_velocity=spin)
         if pinned:
-            add_pins(world, index, body.points[body.points[:, 0] < -0.16], stiffness=500.0)
+            add_pins(world, index, body.cubature.points[body.cubature.points[:, 0] < -0.16], stiffness=500.0)
 
     gravity = (0.0, 0.0, -GRAVITY if pinned else 0.0)
     scene = Scene(populate, [bar()], gravity=gravity, options=options, dt=dt)

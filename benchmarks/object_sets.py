@@ -32,7 +32,7 @@ def sixteen(**options: Any) -> ObjectSet:
 def body_size(objects: ObjectSet, k: int) -> tuple[float, ...]:
     """Build the body of object k of a set into the cache; return functions, samples, points and volume [m^3]."""
     body = load(objects.resolved(LiftSoftConfig().scene.object).config(k)).body
-    return body.function_count, body.surface_count, len(body.weights), body.volume
+    return body.function_count, body.surface_count, len(body.cubature.weights), body.volume
 
 
 def build_all(objects: ObjectSet) -> list[tuple[float, ...]]:

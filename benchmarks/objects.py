@@ -67,8 +67,8 @@ def step_time(name: str) -> str:
 def compliance(config: ObjectConfig, ratio: float, build: BuildOptions) -> float:
     """Return how far a free object gives, per unit of force, under a round patch in the middle of its top [1/m]."""
     body = load(replace(config, build=replace(build, cubature_count=None)), progress=False).body
-    gradient = body.grad_basis.astype(np.float64).transpose(1, 2, 0)
-    value, mode = np.linalg.eigh(reduced_stiffness(gradient, body.weights, ratio))
+    gradient = body.cubature.grad_basis.astype(np.float64).transpose(1, 2, 0)
+    value, mode = np.linalg.eigh(reduced_stiffness(gradient, body.cubature.weights, ratio))
     across = PATCH * (np.mgrid[-10:11, -10:11].reshape(2, -1).T / 20.0)
     across = across[np.linalg.norm(across, axis=1) <= 0.5 * PATCH]
     top = body.bounds[:, :2].mean(axis=0), body.bounds[1, 2]

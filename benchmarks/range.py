@@ -261,7 +261,9 @@ def potential(twin: reference.FreeBody, q: np.ndarray, q_start: np.ndarray, qd_s
         0.5 * m / h**2 * ((moved - h * qd_start) ** 2).sum() + 0.5 * m * material.mass_damping / h * (moved**2).sum()
     )
     F, F_start = twin.deformation_gradient(q), twin.deformation_gradient(q_start)
-    total += twin.body.weights @ reference.viscous_energy(F, F_start, *twin.hooke_moduli, material.viscosity, h)
+    total += twin.body.cubature.weights @ reference.viscous_energy(
+        F, F_start, *twin.hooke_moduli, material.viscosity, h
+    )
     total += 0.5 * twin.pin_stiffness * ((twin.pin_basis @ q) ** 2).sum()
     return float(total + twin.elastic_energy(q) - m * twin.body.mean_basis @ q @ np.asarray(twin.gravity))
 

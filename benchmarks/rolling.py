@@ -34,7 +34,7 @@ def main() -> None:
     print("speed gained over 5/7 g sin at", *ANGLES, "degrees")
     for count in parser.parse_args().samples:
         body = ball(count)
-        areas = body.surface_areas
+        areas = body.surface.areas
         for modulus in (1.0e5, 1.0e6):
             row = [f"{roll(body, modulus, angle):.2f}" for angle in ANGLES]
             spread = areas.std() / areas.mean()

@@ -94,10 +94,12 @@ class Beam:
             viscosity=0.0,
             model=MaterialModel.STABLE_NEO_HOOKEAN,
         )
-        clamp = body.points[:, 0] < body.bounds[0, 0] + CLAMP_LENGTH
+        clamp = body.cubature.points[:, 0] < body.bounds[0, 0] + CLAMP_LENGTH
         for _ in range(body_count):
             instance = add_reduced_body(world, body, material=material)
-            add_pins(world, instance, body.points[clamp], stiffness=CLAMP_STIFFNESS * body.weights[clamp])
+            add_pins(
+                world, instance, body.cubature.points[clamp], stiffness=CLAMP_STIFFNESS * body.cubature.weights[clamp]
+            )
         builder = newton.ModelBuilder()
         register_custom_attributes(builder)
         builder.replicate(world, world_count)

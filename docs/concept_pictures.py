@@ -17,7 +17,6 @@ from scipy.spatial import KDTree
 
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.body.rkpm import make_basis
-from softmode.deformables.body.skinning_weights import SkinningWeights
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body
 from softmode.deformables.quadrature.quadrature import quadrature_from_splats
@@ -104,8 +103,15 @@ def quadrature_picture(folder: Path, painter: Painter, body: ReducedBody, quadra
     middle.plot(*painter.rest.means[shell][:, [0, 2]].T, ".", color=INK, ms=2.5)
     middle.set_title(f"filled: {len(points):,} points with volumes (a slice)", fontsize=10)
     middle.set_aspect("equal")
-    mean = body.weights.mean()
-    right.scatter(body.points[:, 0], body.points[:, 2], s=14 * body.weights / mean, color="#2b6cc9", alpha=0.55, lw=0)
+    mean = body.cubature.weights.mean()
+    right.scatter(
+        body.cubature.points[:, 0],
+        body.cubature.points[:, 2],
+        s=14 * body.cubature.weights / mean,
+        color="#2b6cc9",
+        alpha=0.55,
+        lw=0,
+    )
     right.set_title(f"cubature: {body.point_count} points carry the forces (all)", fontsize=10)
     right.set_aspect("equal")
     save(picture, folder, "quadrature")
@@ -114,7 +120,7 @@ def quadrature_picture(folder: Path, painter: Painter, body: ReducedBody, quadra
 def kernel_picture(folder: Path, body: ReducedBody, quadrature: Quadrature) -> None:
     """Centres with their radii, one kernel, and the sum of all on a slice through the object."""
     picture, ((left, middle, right),) = figure(3)
-    basis = make_basis(quadrature.points - body.offset, body.centres.shape[0], spacing=quadrature.spacing)
+    basis = make_basis(quadrature.points - body.offset, body.kernels.centres.shape[0], spacing=quadrature.spacing)
     near = np.abs(basis.centres[:, 1]) < 0.006
     for centre, radius in zip(basis.centres[near], basis.radii[near], strict=True):
         from matplotlib.patches import Circle
@@ -151,10 +157,11 @@ def mode_picture(folder: Path, painter: Painter, body: ReducedBody) -> None:
     """The skinning weights of the first eigenmodes as colours on the splats."""
     from matplotlib import colormaps
 
-    skin = SkinningWeights(coefficients=body.handles, degrees=body.handle_degrees, blends=body.handle_regions)
     means = painter.rest.means.astype(np.float64)
-    covered = np.where(body.covers(means)[:, None], means, body.centres[KDTree(body.centres).query(means)[1]])
-    weight = body.kernels.evaluate(covered).value @ skin.coefficients
+    covered = np.where(
+        body.covers(means)[:, None], means, body.kernels.centres[KDTree(body.kernels.centres).query(means)[1]]
+    )
+    weight = body.reproducing_kernels.evaluate(covered).value @ body.handles.coefficients
     picture, axes = figure(6, height=2.0)
     zero = np.zeros((body.function_count, 3))
     for j, axis in enumerate(axes[0], start=1):
@@ -189,7 +196,7 @@ def handle_picture(folder: Path, painter: Painter, body: ReducedBody) -> None:
 def step_picture(folder: Path, painter: Painter, body: ReducedBody) -> None:
     """A soft bear falls on the ground: pictures, iterations and how far it is squeezed."""
     world = newton.ModelBuilder()
-    floor = float(-body.surface_points[:, 2].min())
+    floor = float(-body.surface.points[:, 2].min())
     material = Material(youngs_modulus=2.5e3, density=250.0, viscosity=0.004)
     add_reduced_body(world, body, material=material, position=(0.0, 0.0, floor + 0.05))
     world.add_ground_plane()

@@ -73,7 +73,7 @@ def depth(points: NDArray[np.float64], tip: float) -> float:
 def pressed() -> tuple[SplatScene, float]:
     """Return the scene at the end of the press, and how high the sponge was."""
     sponge = load(preset="sponge", material=FOAM, surface_count=3000)
-    top = float(np.ptp(sponge.body.surface_points[:, 2]))
+    top = float(np.ptp(sponge.body.surface.points[:, 2]))
     builder: Any = newton.ModelBuilder()
     table = wp.transform((0.0, 0.0, -0.05), wp.quat_identity())
     builder.add_shape_box(-1, xform=table, hx=2.0, hy=2.0, hz=0.05, color=(0.66, 0.68, 0.70))

@@ -38,8 +38,8 @@ BEND, BULGE = 0.03, 10.0
 
 def modes_of(body: ReducedBody, nodes: Array) -> tuple[Array, Array]:
     """Return the first eigenvalues of a body per E / rho [1/m^2], (6,), and its modes at nodes, (N, 3, 6)."""
-    gradient = body.grad_basis.astype(np.float64).transpose(1, 2, 0)
-    value, mode = np.linalg.eigh(reduced_stiffness(gradient, body.weights, RATIO) / body.volume)
+    gradient = body.cubature.grad_basis.astype(np.float64).transpose(1, 2, 0)
+    value, mode = np.linalg.eigh(reduced_stiffness(gradient, body.cubature.weights, RATIO) / body.volume)
     return value[6:12], np.einsum("pk,dkm->pdm", body.evaluate(nodes)[0], mode[:, 6:12].reshape(3, -1, 6))
 
 
@@ -150,8 +150,8 @@ def main() -> None:
         cells = rows[2 + row].subgridspec(1, 5)
         for column in range(5):
             k = 4 + 5 * row + column
-            values = new.evaluate(new.points)[0][:, k]
-            title = f"$b_{{{k}}}$: {name_of(values, new.points)}"
+            values = new.evaluate(new.cubature.points)[0][:, k]
+            title = f"$b_{{{k}}}$: {name_of(values, new.cubature.points)}"
             draw_function(picture.add_subplot(cells[column]), lambda x, k=k: new.evaluate(x)[0][:, k], title)
     target = folder / "method_functions.png"
     picture.savefig(target, dpi=110, facecolor="white")

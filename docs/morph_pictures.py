@@ -165,7 +165,7 @@ def bar_as_body(times: Array, substeps: int = 1) -> tuple[list[Array], int, floa
     add_reduced_body(builder, body, material=BAR)
     model: Any = builder.finalize(device="cpu")
     solver = SolverReduced(model, [body], options=SolverReducedOptions(integrator="bdf2"))
-    markers = Markers(solver, body.surface_points)
+    markers = Markers(solver, body.surface.points)
     duration = float(times[1]) / substeps
 
     def fall() -> list[Array]:

@@ -100,7 +100,7 @@ def main(arguments: list[str] | None = None) -> None:
         *(make_toy(make_mesh(), 4000 if short else 16000, placed) for placed in (False, True)), strict=True
     )
     scene, energy, moved = make_scene(list(toys), 96 if short else 280), [], []
-    near = [np.linalg.norm(toy.body.surface_points - at, axis=1) < 0.025 for toy, at in zip(toys, tips, strict=True)]
+    near = [np.linalg.norm(toy.body.surface.points - at, axis=1) < 0.025 for toy, at in zip(toys, tips, strict=True)]
     rest = [scene.surface(k)[some].mean(axis=0) for k, some in enumerate(near)]
     with Film(Path("out/excavator.mp4")) as film:
         for frame in range(150):

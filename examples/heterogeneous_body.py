@@ -71,8 +71,8 @@ def settle(bars: list[SoftObject], gravity: tuple[float, float, float], edge: in
         scene.step()
     moved = []
     for k, body in enumerate(bar.body for bar in bars):
-        end = body.surface_points[:, 0] > body.surface_points[:, 0].max() - 1.0e-6
-        moved.append((scene.surface(k) - body.surface_points - placed[k].position)[end].mean(axis=0))
+        end = body.surface.points[:, 0] > body.surface.points[:, 0].max() - 1.0e-6
+        moved.append((scene.surface(k) - body.surface.points - placed[k].position)[end].mean(axis=0))
     return moved, [scene.draw()] if edge else []
 
 

@@ -41,14 +41,14 @@ class Cantilever:
         body = build_body(quadrature, BuildOptions(mode_count=6, kernel_count=200, cubature_count=128), name="bar")
         world = newton.ModelBuilder()
         bar = add_reduced_body(world, body, material=Material(density=600.0, viscosity=0.005))
-        clamped = body.points[body.points[:, 0] < body.bounds[0, 0] + 0.05]
+        clamped = body.cubature.points[body.cubature.points[:, 0] < body.bounds[0, 0] + 0.05]
         add_pins(world, bar, clamped, stiffness=2000.0)
         self.model: Any = world.finalize()
         self.dt, self.step_count = dt, round(duration / dt)
         self.solver = SolverReduced(self.model, [body], options=SolverReducedOptions(tolerance=1.0e-7))
         self.adjoint = AdjointReduced(self.solver, self.step_count)
         chosen = np.random.default_rng(0).choice(body.surface_count, marker_count, replace=False)
-        self.markers = Markers(self.solver, body.surface_points[chosen], instance=bar)
+        self.markers = Markers(self.solver, body.surface.points[chosen], instance=bar)
 
     def tracks(self, modulus: float) -> np.ndarray:
         """Return the positions of the markers [m], shape (step_count + 1, marker_count, 3)."""

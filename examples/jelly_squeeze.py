@@ -69,7 +69,7 @@ class Press:
     def gradients(self) -> np.ndarray:
         """Return the mean deformation gradient of each cube, shape (4, 3, 3)."""
         body = self.thing.body
-        mean = np.einsum("p,pkd->kd", body.weights, body.grad_basis) / body.volume
+        mean = np.einsum("p,pkd->kd", body.cubature.weights, body.cubature.grad_basis) / body.volume
         q = self.states[0].softmode.q.numpy().reshape(len(KEPT), -1, 3)
         return np.eye(3) + np.einsum("bkc,kd->bcd", q, mean)
 

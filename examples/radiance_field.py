@@ -33,7 +33,7 @@ class Falls:
         self.thing = load(field, size=size, material=FOAM, splat_count=3000)
         self.fall = size
         turn = np.array([[0.8, 0.0, 0.6], [0.0, 1.0, 0.0], [-0.6, 0.0, 0.8]])
-        lowest = (self.thing.body.surface_points @ turn.T)[:, 2].min()
+        lowest = (self.thing.body.surface.points @ turn.T)[:, 2].min()
         placed = Placed(object=self.thing, position=(0.0, 0.0, self.fall - lowest), rotation=turn)
         eye, target = (2.2 * size, -2.9 * size, 1.7 * size), (0.0, 0.0, 0.95 * size)
         camera = PinholeCamera.look_at("film", position=eye, target=target, width=edge, height=edge, fov_y=0.62)

@@ -76,7 +76,7 @@ def blow(scene: SplatScene, time: float, speed: float) -> None:
     x, v = scene.surface(0), scene.state.particle_qd.numpy()
     gust = speed * (0.6 + 0.5 * np.sin(4.0 * time - 6.0 * x[:, 0]) * np.sin(9.0 * time + 8.0 * x[:, 2]))
     rush = (np.stack([gust, 0.3 * gust * np.sin(3.0 * time), 0.0 * gust]) - v.T) * (speed > 0.0)
-    scene.push(0, (DRAG * scene.objects[0].body.surface_areas * np.linalg.norm(rush, axis=0) * rush).T)
+    scene.push(0, (DRAG * scene.objects[0].body.surface.areas * np.linalg.norm(rush, axis=0) * rush).T)
 
 
 def test_final(energy: np.ndarray, track: np.ndarray) -> None:

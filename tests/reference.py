@@ -227,7 +227,7 @@ def contact_stiffness(
     wave = E * (1 - nu) / ((1 + nu) * (1 - 2 * nu))
     size = float(np.linalg.norm(np.ptp(body.bounds, axis=0)))
     mass = 1.0 / (1.0 / (material.density * body.volume) + 1.0 / partner_mass)
-    area = min(float(body.surface_areas.sum()), partner_area)
+    area = min(float(body.surface.areas.sum()), partner_area)
     return max(150.0 * wave / size, 100.0 * mass / (area * dt**2), 1.0e8)
 
 
@@ -329,24 +329,24 @@ class Surface:
     @cached_property
     def points(self) -> np.ndarray:
         """Samples (S, 3) [m]."""
-        return self.body.surface_points + self.body.surface_basis.astype(float) @ self.q
+        return self.body.surface.points + self.body.surface.basis.astype(float) @ self.q
 
     @cached_property
     def deformation_gradient(self) -> np.ndarray:
         """F at the samples, (S, 3, 3)."""
-        gradients = self.body.evaluate(self.body.surface_points)[1]
+        gradients = self.body.evaluate(self.body.surface.points)[1]
         return I3 + np.einsum("kc,skd->scd", self.q, gradients)
 
     @cached_property
     def normals(self) -> np.ndarray:
         """Outward unit normals, cof(F) N, (S, 3)."""
-        n = np.einsum("scd,sd->sc", cofactor(self.deformation_gradient), self.body.surface_normals)
+        n = np.einsum("scd,sd->sc", cofactor(self.deformation_gradient), self.body.surface.normals)
         return n / np.linalg.norm(n, axis=1, keepdims=True)
 
     @property
     def spacing(self) -> float:
         """Spacing of the samples [m]."""
-        return float(np.sqrt(self.body.surface_areas.mean()))
+        return float(np.sqrt(self.body.surface.areas.mean()))
 
     def patch(self, x: np.ndarray, n: np.ndarray, radius: float) -> tuple[float, np.ndarray, np.ndarray, int] | None:
         """Return gap [m], normal, weights (S,) and nearest sample of the surface about a sample x with normal n.
@@ -384,7 +384,7 @@ class Surface:
 
     def _around(self, sample: int) -> np.ndarray:
         """Return which samples are among the 32 nearest to one at rest, (S,)."""
-        distance = np.linalg.norm(self.body.surface_points - self.body.surface_points[sample], axis=1)
+        distance = np.linalg.norm(self.body.surface.points - self.body.surface.points[sample], axis=1)
         return distance <= np.sort(distance)[min(32, len(distance)) - 1]
 
     def _beyond_edge(self, x: np.ndarray, centre: np.ndarray, normal: np.ndarray, close: np.ndarray) -> bool:
@@ -401,8 +401,8 @@ class Surface:
         """Return the functions (n,) of the material at x - max(gap, 0) normal, carried there from the samples."""
         gap, normal, w, nearest = patch
         away = x - max(gap, 0.0) * normal - w @ self.points
-        gradient = self.body.evaluate(self.body.surface_points[[nearest]])[1][0]
-        return w @ self.body.surface_basis + gradient @ np.linalg.solve(self.deformation_gradient[nearest], away)
+        gradient = self.body.evaluate(self.body.surface.points[[nearest]])[1][0]
+        return w @ self.body.surface.basis + gradient @ np.linalg.solve(self.deformation_gradient[nearest], away)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -446,16 +446,16 @@ class FreeBody:
 
     def deformation_gradient(self, q: np.ndarray) -> np.ndarray:
         """Return F = I + sum_k q_k grad b_k^T at the cubature points, shape (P, 3, 3)."""
-        return I3 + np.einsum("kc,pkd->pcd", q, self.body.grad_basis.astype(float))
+        return I3 + np.einsum("kc,pkd->pcd", q, self.body.cubature.grad_basis.astype(float))
 
     def elastic_energy(self, q: np.ndarray) -> float:
         """Return sum_p V_p Psi(F_p) [J]."""
-        return float(self.body.weights @ energy(self.material.model, self.deformation_gradient(q), *self.lame))
+        return float(self.body.cubature.weights @ energy(self.material.model, self.deformation_gradient(q), *self.lame))
 
     def elastic_gradient(self, q: np.ndarray) -> np.ndarray:
         """Return sum_p V_p P_p grad b_k [N], shape (n, 3)."""
         P = stress(self.material.model, self.deformation_gradient(q), *self.lame)
-        return np.einsum("p,pcd,pkd->kc", self.body.weights, P, self.body.grad_basis.astype(float))
+        return np.einsum("p,pcd,pkd->kc", self.body.cubature.weights, P, self.body.cubature.grad_basis.astype(float))
 
     def residual(self, q: np.ndarray, q_start: np.ndarray, qd_start: np.ndarray) -> np.ndarray:
         """Return dE/dq [N], shape (n, 3)."""
@@ -463,7 +463,7 @@ class FreeBody:
         inertia = m / h**2 * (q - q_start) - m / h * qd_start + m * material.mass_damping / h * (q - q_start)
         F, F_start = self.deformation_gradient(q), self.deformation_gradient(q_start)
         P = viscous_stress(F, F_start, *self.hooke_moduli, material.viscosity, h)
-        viscous = np.einsum("p,pcd,pkd->kc", self.body.weights, P, self.body.grad_basis.astype(float))
+        viscous = np.einsum("p,pcd,pkd->kc", self.body.cubature.weights, P, self.body.cubature.grad_basis.astype(float))
         pins = self.pin_stiffness * self.pin_basis.T @ (self.pin_basis @ q)
         return inertia + self.elastic_gradient(q) + viscous + pins - m * np.outer(self.body.mean_basis, self.gravity)
 
@@ -479,9 +479,9 @@ class FreeBody:
             )
             C = C + np.einsum("ik,pjl->pijkl", I3, hooke_stress(rate, *self.hooke_moduli))
         C = C + viscous_hessian(F, *self.hooke_moduli, self.material.viscosity, self.dt)
-        grad = self.body.grad_basis.astype(float)
+        grad = self.body.cubature.grad_basis.astype(float)
         n = grad.shape[1]
-        C = (self.body.weights[:, None, None, None, None] * C).swapaxes(1, 2).reshape(-1, 3, 27)
+        C = (self.body.cubature.weights[:, None, None, None, None] * C).swapaxes(1, 2).reshape(-1, 3, 27)
         left = (grad @ C).reshape(-1, n, 3, 3, 3)
         K = np.tensordot(left, grad, axes=((0, 4), (0, 2))).swapaxes(2, 3).reshape(3 * n, 3 * n)
         K += np.kron(self.pin_stiffness * self.pin_basis.T @ self.pin_basis, I3)

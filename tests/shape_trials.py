@@ -115,7 +115,14 @@ def try_build(shape: Shape, options: BuildOptions, point_count: int = 4000) -> B
     local = quadrature.points - mean
     basis, gradient = body.evaluate(quadrature.points - body.offset)
     gram = basis.T @ (weight[:, None] * basis) / quadrature.volume
-    arrays = (body.grad_basis, body.surface_basis, body.weights, body.surface_areas, body.surface_normals, gradient)
+    arrays = (
+        body.cubature.grad_basis,
+        body.surface.basis,
+        body.cubature.weights,
+        body.surface.areas,
+        body.surface.normals,
+        gradient,
+    )
     return BuildTrial(
         name=shape.name,
         point_count=len(quadrature.points),
@@ -342,7 +349,7 @@ def try_pull(name: str, voxels: Voxels, loads: Loads, body: ReducedBody) -> Pull
     _, moved, _ = rest(acceleration, 0.0, LONG_STEP * time, 3)
     by_gravity = mass * acceleration * OBLIQUE @ (body.mean_basis @ moved) / acceleration**2
     _, moved, _ = rest(0.0, total, LONG_STEP * time, 3)
-    at = np.asarray(body.surface_basis[loads.surface], dtype=float) @ moved
+    at = np.asarray(body.surface.basis[loads.surface], dtype=float) @ moved
     by_pull = float((at @ OBLIQUE).mean()) / total
     scene, _, change = rest(acceleration * LARGE / SMALL, 0.0, SHORT_STEP * time, 200)
     return PullTrial(

@@ -95,8 +95,8 @@ def test_build_writes_a_body_with_its_splats(
     assert splats is not None and splats.count >= 400
     assert np.ptp(body.bounds, axis=0).max() == pytest.approx(0.06, rel=0.02)
     assert (body.mode_count, body.point_count) == (2, 48)
-    assert len(body.centres) in (60, 61)  # Beside a gap, as between the plush's legs, kernels may be added.
-    near = np.linalg.norm(splats.means[:, None] - body.surface_points[None], axis=2).min(axis=1)
+    assert len(body.kernels.centres) in (60, 61)  # Beside a gap, as between the plush's legs, kernels may be added.
+    near = np.linalg.norm(splats.means[:, None] - body.surface.points[None], axis=2).min(axis=1)
     assert near.max() < 0.012
     assert main(["body", "check", str(out)]) == 0
     assert f"{body.name}: all is well" in capsys.readouterr().out
@@ -141,11 +141,13 @@ def test_regions_and_stiffness_are_given_where_the_object_stands(assets: Path, t
     size = ["--size", "0.05", "--modes", "2", "--kernels", "60", "--points", "200"]
     assert main(["body", "build", str(assets / "box.obj"), "-o", str(out), *size, *regions, *stiffness]) == 0
     body = ReducedBody.load(out)
-    assert body.region_names == ("foot", "top") and body.driven_count > 0
-    assert body.region_stiffness.tolist() == [0.0, 1e6]
-    np.testing.assert_allclose(body.region_cores[0, 1, 2] + body.offset[2], body.bounds[0, 2] + body.offset[2] + 0.01)
-    right = body.points[:, 0] + body.offset[0] > 0.0
-    assert set(body.stiffness_scale[right]) == {10.0} and set(body.stiffness_scale[~right]) == {1.0}
+    assert body.regions.names == ("foot", "top") and body.driven_count > 0
+    assert body.regions.stiffness.tolist() == [0.0, 1e6]
+    np.testing.assert_allclose(
+        body.flat()["region_cores"][0, 1, 2] + body.offset[2], body.bounds[0, 2] + body.offset[2] + 0.01
+    )
+    right = body.cubature.points[:, 0] + body.offset[0] > 0.0
+    assert set(body.cubature.stiffness_scale[right]) == {10.0} and set(body.cubature.stiffness_scale[~right]) == {1.0}
     assert body.offset[0] == pytest.approx(0.5 * 0.0125, rel=0.01)  # (3 - 1) / (3 + 1) of a quarter of the box's edge
     assert body.surface_count == ObjectConfig().surface_count and body.provenance["option_poissons_ratio"] is None
     assert main(["body", "check", str(out)]) == 0
@@ -219,8 +221,8 @@ def test_object_is_loaded_as_it_was_built(built: bytes, tmp_path: Path) -> None:
     assert splats is not None
     for name in ("means", "quats", "scales", "opacities", "sh"):
         np.testing.assert_array_equal(getattr(thing.splats, name), getattr(splats, name))
-    np.testing.assert_array_equal(thing.body.grad_basis, body.grad_basis)
-    assert thing.height == pytest.approx(0.002 - body.surface_points[:, 2].min())
+    np.testing.assert_array_equal(thing.body.cubature.grad_basis, body.cubature.grad_basis)
+    assert thing.height == pytest.approx(0.002 - body.surface.points[:, 2].min())
     again = tmp_path / "again.npz"
     write_object(again, body, splats)
     assert read_object(again).body.fingerprint == body.fingerprint

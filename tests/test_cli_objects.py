@@ -321,8 +321,8 @@ def test_a_stiffer_part_is_in_the_body(assets: Path) -> None:
     """Points of the half x > 0 of the loaded object are ten times as stiff."""
     config = ObjectConfig(mesh=assets / "open.obj", size=0.06, build=LiftSoftConfig().scene.object.build)
     body = load(config, stiffness=[stiffer_box("half=0,-inf,-inf,inf,inf,inf,10")]).body
-    right = body.points[:, 0] > body.bounds[:, 0].mean()  # The bounding box is centred over the origin.
-    assert set(body.stiffness_scale[right]) == {10.0} and set(body.stiffness_scale[~right]) == {1.0}
+    right = body.cubature.points[:, 0] > body.bounds[:, 0].mean()  # The bounding box is centred over the origin.
+    assert set(body.cubature.stiffness_scale[right]) == {10.0} and set(body.cubature.stiffness_scale[~right]) == {1.0}
 
 
 def test_a_body_file_says_what_it_is_made_of(assets: Path, tmp_path: Path) -> None:

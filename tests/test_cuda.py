@@ -111,9 +111,9 @@ def grip(device: str) -> np.ndarray:
     with wp.ScopedCapture(device=device) as capture:
         two_steps()
     solver.reset(first)
-    order = np.argsort(-cube().surface_points[:, 2])
-    hold = grips.take(cube().surface_points[order[:6]], first)
-    pull = grips.take(cube().surface_points[order[-1:]], first, pulls=True)
+    order = np.argsort(-cube().surface.points[:, 2])
+    hold = grips.take(cube().surface.points[order[:6]], first)
+    pull = grips.take(cube().surface.points[order[-1:]], first, pulls=True)
     grips.aim(pull, grips.pose(pull)[0] + np.array([0.02, 0.0, 0.0]))
     grips.aim(hold, grips.pose(hold)[0] + np.array([0.0, 0.01, 0.0]), (0.0, 0.0, 0.6, 0.8))
     grips.begin_frame(40)

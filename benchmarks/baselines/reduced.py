@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from benchmarks.baselines.common import CLAMP, SCENE, SOFT, STIFFNESS, Row, measure, sample
 from benchmarks.baselines.neural_weights import NeuralWeights, NeuralWeightsOptions, train_neural_weights
+from softmode.deformables.body.records import BodyCubature
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.body.regions import Region
 from softmode.deformables.body.skinning_weights import SkinningWeights
@@ -137,11 +138,12 @@ def neural_body(options: NeuralWeightsOptions) -> NeuralBody:
     fields = {f.name: getattr(body, f.name) for f in dataclasses.fields(body)}
     fields |= {
         "name": "beam, neural weights",
-        "points": points[chosen.index],
-        "weights": chosen.weights,
-        "grad_basis": gradient[chosen.index].astype(np.float32),
-        "stiffness_scale": np.ones(len(chosen.index)),
-        "surface_basis": np.zeros((body.surface_count, found.transform.shape[1]), dtype=np.float32),
+        "cubature": BodyCubature(
+            points=points[chosen.index],
+            weights=chosen.weights,
+            grad_basis=gradient[chosen.index].astype(np.float32),
+            stiffness_scale=np.ones(len(chosen.index)),
+        ),
         "mean_basis": found.mean,
         "linear_coordinates": found.linear,
         "transform": found.transform,
@@ -149,8 +151,8 @@ def neural_body(options: NeuralWeightsOptions) -> NeuralBody:
     }
     effective = float(spread.sum() ** 2 / (spread**2).sum())
     made = NeuralBody(**fields, network=network, mean=mean, mix=mix, effective_count=effective)
-    surface = made.evaluate(made.surface_points)[0].astype(np.float32)
-    return dataclasses.replace(made, surface_basis=surface)
+    surface = made.evaluate(made.surface.points)[0].astype(np.float32)
+    return dataclasses.replace(made, surface=dataclasses.replace(made.surface, basis=surface))
 
 
 @functools.cache

@@ -18,6 +18,7 @@ from benchmarks.accuracy import FINE_RANK, KAPPA, affine, soft
 from benchmarks.accuracy_runner import Row, Simulation, body_of, compare, quadrature_of, reference_at
 from benchmarks.baselines.mpm import Particles
 from benchmarks.freeform.paper import MODES
+from softmode.deformables.body.records import BodyCubature
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.reduction.options import BuildOptions
 from tests.oracle import frames
@@ -129,10 +130,12 @@ def at_random(body: ReducedBody, count: int = 5000, seed: int = 0) -> ReducedBod
     points = np.random.default_rng(seed).uniform(*body.bounds, size=(count, 3))
     return dataclasses.replace(
         body,
-        points=points,
-        weights=np.full(count, body.volume / count),
-        grad_basis=body.evaluate(points)[1].astype(np.float32),
-        stiffness_scale=np.ones(count),
+        cubature=BodyCubature(
+            points=points,
+            weights=np.full(count, body.volume / count),
+            grad_basis=body.evaluate(points)[1].astype(np.float32),
+            stiffness_scale=np.ones(count),
+        ),
         fingerprint=f"{body.fingerprint} random {seed}",
     )
 

@@ -74,8 +74,8 @@ def make_problem(kernel_count: int = KERNEL_COUNT, point_count: int = 5000) -> P
     """Evaluate the kernels of a build, whose centres another rounding of the points would move."""
     quadrature = quadrature_of(BEND.shape, point_count)
     body = build_body(quadrature, freeform(MODE_COUNT, kernel_count=kernel_count), progress=False)
-    grid = body.kernels.evaluate(quadrature.points - body.offset)
-    pool = body.kernels.evaluate(np.random.default_rng(1).uniform(*body.bounds, size=(POOL, 3)))
+    grid = body.reproducing_kernels.evaluate(quadrature.points - body.offset)
+    pool = body.reproducing_kernels.evaluate(np.random.default_rng(1).uniform(*body.bounds, size=(POOL, 3)))
     share = quadrature.weights / quadrature.volume
     return Problem(quadrature.volume, grid, pool, *mass_and_gradient_matrix(grid, share, share))
 

@@ -98,7 +98,7 @@ def clutter_parameters(config: TaskConfig, held: Occupancy, arcs: Arcs) -> tuple
     if not count:
         return ()
     scale = (config.scale_range or (1.0, 1.0))[1]
-    radius = scale * max(float(np.linalg.norm(one.body.surface_points[:, :2], axis=1).max()) for one in held.choices)
+    radius = scale * max(float(np.linalg.norm(one.body.surface.points[:, :2], axis=1).max()) for one in held.choices)
     spread = 0.5 * config.others_clearance
     places = ring_places(count, 2.0 * radius + config.others_clearance, spread, arcs)
     _check_table(config, places, radius, spread, arcs)

@@ -158,7 +158,7 @@ class ScriptedGrasp(ScriptedPolicy):
         """Choose a grasp where the object is, another one after every failed attempt; None if none fits any more."""
         body, scale = self.soft.body, self.material("scale")
         points = self.surfaces()
-        turn = Rotation.align_vectors(points[0] - points[0].mean(0), body.surface_points - body.surface_points.mean(0))[
+        turn = Rotation.align_vectors(points[0] - points[0].mean(0), body.surface.points - body.surface.points.mean(0))[
             0
         ]
         stiffness = self.material("youngs_modulus") * scale
@@ -166,8 +166,8 @@ class ScriptedGrasp(ScriptedPolicy):
         try:
             found = plan_grasps(
                 points[0],
-                turn.apply(body.surface_normals),
-                body.surface_areas * scale**2,
+                turn.apply(body.surface.normals),
+                body.surface.areas * scale**2,
                 self._jaw,
                 friction=self._friction(),
                 force=self._wanted_force(),

@@ -164,7 +164,7 @@ class Task:
             kept = [_kept(config, material) for material in held.materials]
             self.table = ParameterTable(self.parameters(), held, kept)
             self.materials = Materials(scene.solver, self.table, len(scene.objects), kept)
-            points = [sample_farthest(thing.body.surface_points, self.point_count, first=0) for thing in held.choices]
+            points = [sample_farthest(thing.body.surface.points, self.point_count, first=0) for thing in held.choices]
             self.points_of_choices: NDArray[np.intp] = np.stack(points)
             self.points = self.points_of_choices[held.rows[0]]
             heights = np.array([thing.height for thing in held.choices])

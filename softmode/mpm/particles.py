@@ -173,8 +173,9 @@ def particles_from_body(
         return ParticleBody(positions=points, masses=made.density * volumes, material=made)
     from softmode.deformables.quadrature.interior import winding_numbers
 
+    surface = (body.surface.points, body.surface.normals, body.surface.areas)
     return particles_from_shape(
-        lambda points: winding_numbers(body, points) > 0.5,
+        lambda points: winding_numbers(points, *surface) > 0.5,
         body.bounds,
         spacing=spacing,
         material=made,

@@ -128,7 +128,7 @@ def file_kind(path: str | os.PathLike[str]) -> FileKind:
 
 def surface_cover(body: ReducedBody, color: tuple[float, float, float] = (0.55, 0.63, 0.75)) -> Splats:
     """Return splats on the surface samples of a body, lit from above, for a body that has none of its own."""
-    light = 0.7 + 0.3 * np.clip(body.surface_normals @ _LIGHT, -1.0, 1.0)
+    light = 0.7 + 0.3 * np.clip(body.surface.normals @ _LIGHT, -1.0, 1.0)
     return splats_from_points(
-        body.surface_points, body.surface_normals, light[:, None] * np.asarray(color), name=body.name
+        body.surface.points, body.surface.normals, light[:, None] * np.asarray(color), name=body.name
     )

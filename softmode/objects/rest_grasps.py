@@ -33,15 +33,15 @@ def rest_grasps(
     """
     weight = 9.81 * density * body.volume
     return plan_grasps(
-        body.surface_points,
-        body.surface_normals,
-        body.surface_areas,
+        body.surface.points,
+        body.surface.normals,
+        body.surface.areas,
         jaw,
         friction=friction,
         force=max(6.0, 2.5 * weight / friction),
         weight=weight,
         centre=np.zeros(3),
         modes=None if youngs_modulus is None else surface_modes(body) / np.sqrt(youngs_modulus),
-        ground=float(body.surface_points[:, 2].min()),
+        ground=float(body.surface.points[:, 2].min()),
         count=3,
     )

@@ -68,7 +68,7 @@ class SoftObject:
         Counted from the lowest surface sample, and from the contact radius below it where no region holds the object.
         """
         lifted = 0.0 if self.body.driven_count else self.contact_radius
-        return float(-self.body.surface_points[:, 2].min()) + lifted
+        return float(-self.body.surface.points[:, 2].min()) + lifted
 
     def findings(self, *, jaw: ParallelJaw | None = None) -> tuple[Finding, ...]:
         """Return what its user should know before it is simulated; see `object_findings`.
@@ -106,7 +106,7 @@ class SoftObject:
     @cached_property
     def radius(self) -> float:
         """Distance of the farthest surface sample from the origin of the body frame [m]."""
-        return float(np.linalg.norm(self.body.surface_points, axis=1).max())
+        return float(np.linalg.norm(self.body.surface.points, axis=1).max())
 
     @cached_property
     def dents(self) -> DentWeights:

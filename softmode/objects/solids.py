@@ -177,9 +177,10 @@ def _solid_of_object(config: ObjectConfig, name: str) -> Solid:
     factor = float(np.cbrt(np.linalg.det(turn)))
     rotation = turn / factor
     turned = None if np.allclose(rotation, np.eye(3), atol=1e-12) else rotation
+    surface = (quadrature.surface_points, quadrature.surface_normals, quadrature.surface_areas)
     return Solid(
         name=name,
-        inside=lambda points: winding_numbers(quadrature, points) > 0.5,
+        inside=lambda points: winding_numbers(points, *surface) > 0.5,
         bounds=quadrature.bounds,
         volume=quadrature.volume,
         splats=source.splats.transformed(turned, scale=factor),

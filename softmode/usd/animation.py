@@ -267,7 +267,7 @@ class UsdAnimation:
 
     def _surfaces(self) -> NDArray[np.float64]:
         """Return where the surface samples of all bodies were in all frames [m], shape (N, 3)."""
-        bodies = [(p.body.surface_points, p.body.surface_basis.astype(np.float64)) for p in self._placed]
+        bodies = [(p.body.surface.points, p.body.surface.basis.astype(np.float64)) for p in self._placed]
         return np.concatenate([x + b @ q for frame in self._states for (x, b), q in zip(bodies, frame, strict=True)])
 
     def _author_motion(
@@ -284,7 +284,7 @@ class UsdAnimation:
         UsdGeom, Vt = openusd("UsdGeom", "Vt")
         body, prim = placed.body, stage.GetPrimAtPath(path)
         handles = attribute(prim, tokens.HANDLES, "Matrix4dArray", None, custom=True)
-        curved = bool((body.handle_degrees == 2).any())
+        curved = bool((body.handles.degrees == 2).any())
         more = attribute(prim, tokens.HANDLES_QUADRATIC, "Double3Array", None, custom=True) if curved else None
         local, seen = np.empty((len(states), body.function_count, 3)), list[Dents]()
         for f, (code, q, dent) in enumerate(zip(codes, states, dents, strict=True)):
@@ -318,9 +318,9 @@ class UsdAnimation:
         """Author points and splats frame by frame, in the frame of their body."""
         UsdGeom, UsdVol = openusd("UsdGeom", "UsdVol")
         points = UsdGeom.Points(stage.GetPrimAtPath(f"{path}/Simulation"))
-        basis = placed.body.evaluate(placed.body.points)[0]
+        basis = placed.body.evaluate(placed.body.cubature.points)[0]
         for code, q in zip(codes, local, strict=True):
-            set_points(points, placed.body.points + basis @ q, code)
+            set_points(points, placed.body.cubature.points + basis @ q, code)
         if placed.splats is None:
             return
         prim = UsdVol.ParticleField3DGaussianSplat(stage.GetPrimAtPath(f"{path}/Splats"))

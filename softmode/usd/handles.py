@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 def handle_order(body: ReducedBody) -> NDArray[np.intp]:
     """Return softmode's index of each handle of a file: all but the constant one, then that."""
-    return np.roll(np.arange(len(body.handle_degrees)), -1)
+    return np.roll(np.arange(len(body.handles.degrees)), -1)
 
 
 def handle_weights(body: ReducedBody, points: ArrayLike) -> tuple[Array, Array]:
@@ -43,10 +43,10 @@ def handles_from_coordinates(body: ReducedBody, q: ArrayLike) -> tuple[Array, Ar
     """
     raw = body.transform @ np.asarray(q, dtype=np.float64)
     starts = _starts(body)
-    matrices, quadratic = np.zeros((len(body.handle_degrees), 4, 4)), []
+    matrices, quadratic = np.zeros((len(body.handles.degrees), 4, 4)), []
     for k, j in enumerate(handle_order(body)):
         rows = raw[starts[j] : starts[j + 1]]
-        degree = body.handle_degrees[j]
+        degree = body.handles.degrees[j]
         if degree == 0:
             matrices[k, 3, :3] = rows[0]
             continue
@@ -72,7 +72,7 @@ def coordinates_from_handles(body: ReducedBody, matrices: ArrayLike, quadratic: 
     raw = np.zeros((*m.shape[:-3], len(body.transform), 3))
     seen = 0
     for k, j in enumerate(handle_order(body)):
-        first, degree = starts[j], body.handle_degrees[j]
+        first, degree = starts[j], body.handles.degrees[j]
         if degree == 0:
             raw[..., first, :] = m[..., k, 3, :3]
             continue
@@ -86,7 +86,7 @@ def coordinates_from_handles(body: ReducedBody, matrices: ArrayLike, quadratic: 
 
 def _starts(body: ReducedBody) -> NDArray[np.int64]:
     """Return the first raw function of every handle, and their number."""
-    return np.concatenate([[0], np.cumsum([len(MONOMIALS[d]) for d in body.handle_degrees])])
+    return np.concatenate([[0], np.cumsum([len(MONOMIALS[d]) for d in body.handles.degrees])])
 
 
 def rigid_motion(body: ReducedBody, q: ArrayLike) -> tuple[Array, Array]:

@@ -25,15 +25,15 @@ from softmode.usd.handles import handle_weights
 
 def exchangeable(body: ReducedBody) -> bool:
     """Return whether Kaolin can express a body: no handle is quadratic."""
-    return bool((body.handle_degrees <= 1).all())
+    return bool((body.handles.degrees <= 1).all())
 
 
 def material_values(body: ReducedBody, material: Material) -> dict[str, Any]:
     """Return what `KaolinPhysicsMaterialAPI` says: points [m], E [Pa], nu, density [kg/m^3] and the volume [m^3]."""
     count = body.point_count
     return {
-        "pts": body.points.astype(np.float32),
-        "yms": (material.youngs_modulus * body.stiffness_scale).astype(np.float32),
+        "pts": body.cubature.points.astype(np.float32),
+        "yms": (material.youngs_modulus * body.cubature.stiffness_scale).astype(np.float32),
         "prs": np.full(count, material.poissons_ratio, np.float32),
         "rhos": np.full(count, material.density, np.float32),
         "appx_vol": float(body.volume),
@@ -48,10 +48,10 @@ def skinned_values(body: ReducedBody, material: Material, splat_weights: NDArray
         material: Its material.
         splat_weights: Weights of the splats, shape (N, J), or None without splats.
     """
-    weight, gradient = handle_weights(body, body.points)
-    share = body.weights * (body.point_count / body.volume)
+    weight, gradient = handle_weights(body, body.cubature.points)
+    share = body.cubature.weights * (body.point_count / body.volume)
     values = material_values(body, material)
-    values["yms"] = (material.youngs_modulus * body.stiffness_scale * share).astype(np.float32)
+    values["yms"] = (material.youngs_modulus * body.cubature.stiffness_scale * share).astype(np.float32)
     values["rhos"] = (material.density * share).astype(np.float32)
     values["skinning_weights"] = weight.astype(np.float32)
     values["dwdx"] = gradient.astype(np.float32)

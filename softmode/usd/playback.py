@@ -51,8 +51,8 @@ class PlayedBody:
     def points_at(self, frame: int) -> Array:
         """Return its surface samples in the world in one frame, dents in [m], shape (S, 3)."""
         body = self.object.body
-        moved = body.surface_basis.astype(np.float64) @ self.coordinates[frame]
-        return body.surface_points + moved + self.dents_at(frame)
+        moved = body.surface.basis.astype(np.float64) @ self.coordinates[frame]
+        return body.surface.points + moved + self.dents_at(frame)
 
     def dents_at(self, frame: int) -> NDArray[np.float32]:
         """Return the dents of its surface samples in the world in one frame [m], shape (S, 3)."""
@@ -108,8 +108,8 @@ def _played(sent: dict[str, Any], arrays: list[NDArray[Any]], rate: float, name:
     bundle = {**sent["bundle"]["values"], **{key: arrays[k] for key, k in sent["bundle"]["arrays"].items()}}
     body = body_of(bundle, source)
     codes, places = arrays[sent["codes"]], arrays[sent["places"]].reshape(-1, 4, 4)
-    curved = int((body.handle_degrees == 2).sum())
-    matrices = np.array([arrays[k] for k in sent["handles"]]).reshape(len(codes), len(body.handle_degrees), 4, 4)
+    curved = int((body.handles.degrees == 2).sum())
+    matrices = np.array([arrays[k] for k in sent["handles"]]).reshape(len(codes), len(body.handles.degrees), 4, 4)
     quadratic = np.array([arrays[k] for k in sent["quadratic"]]).reshape(len(codes), curved, 6, 3)
     if not all(np.isfinite(values).all() for values in (codes, places, matrices, quadratic)):
         raise AssetError(f"{source}: its time samples are not all finite", hint=REEXPORT)

@@ -254,12 +254,13 @@ def _author_material(stage: Stage, prim: Prim, material: Material) -> None:
 def _author_points(points: Prim, placed: Placed) -> None:
     """Author the simulation geometry: the cubature points, which fill the body, with widths and masses."""
     UsdGeom, Vt = openusd("UsdGeom", "Vt")
-    body = placed.body
+    found = placed.body.cubature
     points.GetPrim().AddAppliedSchema(tokens.POINTS_SIM_API)
-    points.CreateWidthsAttr(float_array(np.cbrt(body.weights)))  # edge of a cube of as much volume
+    points.CreateWidthsAttr(float_array(np.cbrt(found.weights)))  # edge of a cube of as much volume
     points.SetWidthsInterpolation(UsdGeom.Tokens.vertex)
-    set_points(points, body.points)
-    attribute(points.GetPrim(), tokens.MASSES, "FloatArray", float_array(body.weights * (placed.mass / body.volume)))
+    set_points(points, found.points)
+    masses = found.weights * (placed.mass / placed.body.volume)
+    attribute(points.GetPrim(), tokens.MASSES, "FloatArray", float_array(masses))
     # What the physics is made of, not what one looks at: viewers hide it by default.
     points.CreatePurposeAttr(UsdGeom.Tokens.guide)
     points.CreateDisplayColorAttr(Vt.Vec3fArray([(0.2, 0.5, 0.9)]))

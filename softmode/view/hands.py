@@ -88,7 +88,7 @@ class Hands:
             X = grip.rest_points + before[index].offset
             owners = [k for k, origin in enumerate(came_from) if origin == index]
             bodies = [self._scene.grips[k].body for k in owners]
-            places = [np.concatenate([body.surface_points, body.points]) + body.offset for body in bodies]
+            places = [np.concatenate([body.surface.points, body.cubature.points]) + body.offset for body in bodies]
             nearest = np.argmin([KDTree(place).query(X)[0] for place in places], axis=0)
             most = int(np.bincount(nearest).argmax())
             mine = nearest == most
@@ -143,7 +143,7 @@ class Hands:
         require_number("radius", reach, above=0.0, unit="m")
         if len(self._pins.keys() - self._own) >= self._options.pin_max:
             raise ConfigError(f"there are {self._options.pin_max} pins already", hint="let go of one first")
-        X = np.concatenate([body.surface_points, body.points])
+        X = np.concatenate([body.surface.points, body.cubature.points])
         distance = np.linalg.norm(X - hit.rest_point, axis=1)
         inside = np.argsort(distance)[: max(int((distance <= reach).sum()), 4)]
         spread = sample_farthest(X[inside], self._options.pin_points, first=0)

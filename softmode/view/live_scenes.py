@@ -127,7 +127,7 @@ class ObjectScene:
 def held_points(thing: SoftObject, hold: HoldName, count: int) -> Vector:
     """Return the surface samples by which a hanging object is held, spread over its top or base, shape (n, 3)."""
     sign = 1.0 if hold == "top" else -1.0
-    X = thing.body.surface_points
+    X = thing.body.surface.points
     z = sign * X[:, 2]
     order = np.argsort(-z)
     chosen = order[: max(int((z > z.max() - HELD_PART * np.ptp(z)).sum()), 4)]

@@ -77,8 +77,8 @@ def pin_regions(body: ReducedBody, grips: Iterable[Grip], strength: GripOptions)
         if grip.pulls:
             continue
         X, radius = grip.rest_points, _apart(grip.rest_points)
-        inside = KDTree(X).query(body.points)[0] <= radius
-        volume = max(float(body.weights[inside].sum()), float(body.weights.min()))
+        inside = KDTree(X).query(body.cubature.points)[0] <= radius
+        volume = max(float(body.cubature.weights[inside].sum()), float(body.cubature.weights.min()))
         stiffness = strength.hold_stiffness * float(np.linalg.norm(np.ptp(body.bounds, axis=0))) / volume
         name = f"pin {len(regions) + 1}"
         regions.append(Region(name=name, points=X + body.offset, radius=radius, stiffness=stiffness))

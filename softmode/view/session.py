@@ -548,7 +548,7 @@ class LiveSession:
         body = self._object(index).body
         given = unpack_sources(body)
         X = np.array([hit.rest_point for hit in hits if hit.object_index == index])
-        inward = -body.surface_normals[KDTree(body.surface_points).query(X)[1]]
+        inward = -body.surface.normals[KDTree(body.surface.points).query(X)[1]]
         reached = brushed(given.quadrature.points, X + body.offset, inward, radius, depth)
         if not reached.any():
             raise ConfigError("no point of the object is within the brush's reach", hint="enlarge radius or depth")

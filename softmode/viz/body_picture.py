@@ -92,7 +92,7 @@ def write_body_picture(
         x, y, z = 1e2 * np.ptp(body.bounds, axis=0)
         facts = (
             f"{x:.3g} x {y:.3g} x {z:.3g} cm, {1e6 * body.volume:.4g} cm$^3$ · {body.function_count} functions · "
-            f"{body.mode_count} handles · {body.point_count} cubature points · {len(body.centres)} kernels"
+            f"{body.mode_count} handles · {body.point_count} cubature points · {len(body.kernels.centres)} kernels"
         )
         figure.text(0.02, 1.0 - 0.35 / height, body.name, fontsize=15, weight="bold")
         figure.text(0.985, 1.0 - 0.35 / height, facts, fontsize=10, ha="right", color="0.3")
@@ -141,7 +141,7 @@ def _weights(body: ReducedBody, splats: Splats) -> tuple[list[str], list[Array]]
     title, color = _first(body, x)
     names, colors = [title], [color]
     ranks = _weight_names(body)
-    for j in range(1, min(len(body.handle_degrees), COLUMNS)):
+    for j in range(1, min(len(body.handles.degrees), COLUMNS)):
         one = weight[:, j] / max(float(np.abs(weight[:, j]).max()), 1e-300)
         names.append(ranks[j])
         colors.append(np.asarray(colormaps["RdBu_r"](0.5 + 0.5 * one))[:, :3])
@@ -150,10 +150,10 @@ def _weights(body: ReducedBody, splats: Splats) -> tuple[list[str], list[Array]]
 
 def _weight_names(body: ReducedBody) -> list[str]:
     """Return what each skinning weight is: constant, of regions, eigenmodes, then static responses."""
-    responses = int((body.handle_degrees == 0).sum())
-    regions = len(body.handle_degrees) - responses - len(body.eigenvalues)
-    order = [name for name, k in zip(body.region_names, body.region_stiffness, strict=True) if k == 0.0]
-    order += [name for name, k in zip(body.region_names, body.region_stiffness, strict=True) if k > 0.0]
+    responses = int((body.handles.degrees == 0).sum())
+    regions = len(body.handles.degrees) - responses - len(body.eigenvalues)
+    order = [name for name, k in zip(body.regions.names, body.regions.stiffness, strict=True) if k == 0.0]
+    order += [name for name, k in zip(body.regions.names, body.regions.stiffness, strict=True) if k > 0.0]
     modes = [f"weight {k}: {value:.3g} / m$^2$" for k, value in enumerate(body.eigenvalues[1:], start=1)]
     return ["constant", *(f"region {name}" for name in order[:regions]), *modes, *["static response"] * responses]
 
@@ -162,19 +162,20 @@ def _first(body: ReducedBody, x: Array) -> tuple[str, Array]:
     """Return title and colours (N, 3) that show where a body is stiffer, or its regions."""
     from matplotlib import colormaps
 
-    low, high = body.stiffness_scale.min(), body.stiffness_scale.max()
+    scale = body.cubature.stiffness_scale
+    low, high = scale.min(), scale.max()
     if high > 1.0001 * low:
-        level = np.log(body.stiffness_scale[KDTree(body.points).query(x)[1]] / low) / np.log(high / low)
+        level = np.log(scale[KDTree(body.cubature.points).query(x)[1]] / low) / np.log(high / low)
         return f"stiffness x {low:.2g} to {high:.2g}", np.asarray(colormaps["viridis"](level))[:, :3]
     found = np.full((len(x), 3), 0.86)
-    for region in body.regions:
+    for region in body.regions.parts:
         found[region.distance(x)[0] <= 0.0] = _REGION
-    return "regions: " + ", ".join(body.region_names) if body.region_names else "surface", found
+    return "regions: " + ", ".join(body.regions.names) if body.regions.names else "surface", found
 
 
 def _painted(body: ReducedBody, splats: Splats, colors: Array) -> Splats:
     """Return the splats in other colours, shaded by the surface's normal so that the shape can be seen."""
-    normal = body.surface_normals[KDTree(body.surface_points).query(splats.means)[1]]
+    normal = body.surface.normals[KDTree(body.surface.points).query(splats.means)[1]]
     light = 0.62 + 0.38 * np.clip(normal @ (_LIGHT / np.linalg.norm(_LIGHT)), 0.0, 1.0)
     return replace(splats, sh=((colors * light[:, None] - 0.5) / SH_DC)[:, None])
 
@@ -231,7 +232,7 @@ def _strip(figure: Any, row: Any, titles: list[str], pictures: list[NDArray[np.u
 def _plane(axes: Any, body: ReducedBody, title: str) -> tuple[Array, Array]:
     """Prepare a panel that looks at the body from the camera's side; return the directions in the picture."""
     right, up = _camera_axes()
-    axes.scatter(body.surface_points @ right, body.surface_points @ up, s=3, color="0.82", linewidths=0)
+    axes.scatter(body.surface.points @ right, body.surface.points @ up, s=3, color="0.82", linewidths=0)
     axes.set_aspect("equal")
     axes.set_axis_off()
     axes.set_title(title, fontsize=9, pad=3)
@@ -241,11 +242,11 @@ def _plane(axes: Any, body: ReducedBody, title: str) -> tuple[Array, Array]:
 def _draw_points(axes: Any, body: ReducedBody) -> None:
     """Draw the cubature points, as large as their volume, near ones darker."""
     right, up = _plane(axes, body, "cubature points by volume")
-    order = np.argsort(body.points @ TOWARDS)
-    depth = body.points[order] @ TOWARDS
+    order = np.argsort(body.cubature.points @ TOWARDS)
+    depth = body.cubature.points[order] @ TOWARDS
     shade = (depth - depth[0]) / max(float(np.ptp(depth)), 1e-300)
-    look = {"s": 5000.0 * body.weights[order] / body.volume, "linewidths": 0.3, "edgecolors": "white"}
-    x, y = body.points[order] @ right, body.points[order] @ up
+    look = {"s": 5000.0 * body.cubature.weights[order] / body.volume, "linewidths": 0.3, "edgecolors": "white"}
+    x, y = body.cubature.points[order] @ right, body.cubature.points[order] @ up
     axes.scatter(x, y, c=0.25 + 0.65 * shade, cmap="Blues", vmin=0.0, vmax=1.0, **look)
 
 
@@ -254,9 +255,9 @@ def _draw_kernels(axes: Any, body: ReducedBody) -> None:
     from matplotlib.patches import Circle
 
     right, up = _plane(axes, body, "kernels, some radii")
-    x, y = body.centres @ right, body.centres @ up
+    x, y = body.kernels.centres @ right, body.kernels.centres @ up
     axes.scatter(x, y, s=5, color="#7a3e9d", linewidths=0)
-    for place in np.column_stack([x, y, body.radii])[::10].tolist():
+    for place in np.column_stack([x, y, body.kernels.radii])[::10].tolist():
         axes.add_patch(Circle(place[:2], place[2], fill=False, color="#7a3e9d", alpha=0.35, lw=0.7))
     axes.autoscale_view()
 

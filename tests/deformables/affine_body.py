@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 
 import numpy as np
 
 from softmode.deformables.body.reduced_body import ReducedBody
-from tests.bodies import two_modes
+from tests.bodies import changed, two_modes
 
 
 @functools.cache
@@ -19,12 +18,12 @@ def affine_cube(edge: float = 1.0) -> ReducedBody:
     """
     body = two_modes(edge)
     names = ("mean_basis", "linear_coordinates")
-    changes = {name: np.ascontiguousarray(getattr(body, name)[:4]) for name in names}
+    changes = {name: np.ascontiguousarray(body.flat()[name][:4]) for name in names}
     names = ("grad_basis", "surface_basis", "transform")
-    changes |= {name: np.ascontiguousarray(getattr(body, name)[:, :4]) for name in names}
-    return dataclasses.replace(body, **changes, fingerprint=f"{body.fingerprint}, affine")
+    changes |= {name: np.ascontiguousarray(body.flat()[name][:, :4]) for name in names}
+    return changed(body, **changes, fingerprint=f"{body.fingerprint}, affine")
 
 
 def mean_gradient(body: ReducedBody, q: np.ndarray) -> np.ndarray:
     """Return the deformation gradient F (3, 3) that an affine body has at coordinates q (4, 3)."""
-    return np.eye(3) + np.einsum("kc,kd->cd", q, body.grad_basis.astype(float).mean(axis=0))
+    return np.eye(3) + np.einsum("kc,kd->cd", q, body.cubature.grad_basis.astype(float).mean(axis=0))

@@ -52,7 +52,7 @@ class Rollout:
                 world, body, material=material, velocity=(0.3, -0.2, 0.5), angular_velocity=(4.0, -6.0, 3.0)
             )
             if not body.driven_count:
-                add_pins(world, index, body.points[body.points[:, 2] > 0.03], stiffness=20.0)
+                add_pins(world, index, body.cubature.points[body.cubature.points[:, 2] > 0.03], stiffness=20.0)
 
         self.scene = Scene(
             populate, [body], gravity=(0.0, 0.0, -GRAVITY), options=options, dt=DT, world_count=world_count
@@ -186,7 +186,7 @@ def test_gradient_with_driven_functions(name, step, options):
 def test_gradient_by_point_forces():
     """Markers turn dL/d(generalised force) into dL/d(particle_f), which a state keeps in float32."""
     case = hanging()
-    samples = Markers(case.scene.reduced, case.body.surface_points)
+    samples = Markers(case.scene.reduced, case.body.surface.points)
     by_particle = samples.interpolate(case.gradients()["force"])
     gradient = float((by_particle * case.path["particle_force"]).sum())
     assert gradient == pytest.approx(case.difference("particle_force", 0.25), rel=100 * FLOAT32)
@@ -223,7 +223,7 @@ def test_field_of_moduli():
     field = gradients["log_modulus"][0]
     assert field.sum() == pytest.approx(MATERIAL.youngs_modulus * gradients["youngs_modulus"][0], rel=1e-6)
     array = case.scene.reduced.view.basis.stiffness_scale
-    half, losses, h = case.body.points[:, 0] > 0.0, [], 2.0**-9
+    half, losses, h = case.body.cubature.points[:, 0] > 0.0, [], 2.0**-9
     for factor in (-1.0, 1.0):
         array.assign(np.where(half, 1.0 + factor * h, 1.0).astype(np.float32))
         losses.append(case.run())
@@ -236,7 +236,7 @@ def test_field_of_moduli():
 def test_marker_loss():
     """The loss of tracked points: Markers.spread is the transpose of Markers.positions."""
     case, rng = hanging(), np.random.default_rng(3)
-    markers = Markers(case.scene.reduced, case.body.surface_points[::10])
+    markers = Markers(case.scene.reduced, case.body.surface.points[::10])
     case.run()
     q, weight = case.adjoint.q.numpy(), rng.normal(size=(STEPS + 1, len(markers.points), 3))
     x, delta = markers.positions(q), rng.normal(size=q.shape)
@@ -296,7 +296,7 @@ def gradients_on(device):
 
     world, builder = newton.ModelBuilder(), newton.ModelBuilder()
     index = add_reduced_body(world, cube(), material=MATERIAL, angular_velocity=(4.0, -6.0, 3.0))
-    add_pins(world, index, cube().points[cube().points[:, 2] > 0.03], stiffness=20.0)
+    add_pins(world, index, cube().cubature.points[cube().cubature.points[:, 2] > 0.03], stiffness=20.0)
     register_custom_attributes(builder)
     builder.replicate(world, 2)
     model = builder.finalize(device=device)

@@ -134,7 +134,7 @@ def test_an_attachment_is_moved_in_a_recorded_graph():
         still.step(2)
     for name in ("q", "qd"):
         np.testing.assert_array_equal(getattr(scene, name)(0), getattr(still, name)(0))
-    top = body.surface_points[:, 2] >= TOP[0][2]
+    top = body.surface.points[:, 2] >= TOP[0][2]
     hung, moved = scene.state.particle_q.numpy().reshape(2, -1, 3)[:, top].astype(float)
     np.testing.assert_allclose(moved, hung @ rotation((0, 0, 1), 0.8).T + shift, atol=1e-3 * EDGE)
     poses.fill_(wp.transform_identity())
@@ -251,7 +251,7 @@ def test_own_surface_can_be_attached():
     body = default_box()
     builder = newton.ModelBuilder()
     soft = add_reduced_body(builder, body)
-    found = attach(builder, soft, body, points=body.surface_points)
-    assert found.count == len(body.surface_points)
+    found = attach(builder, soft, body, points=body.surface.points)
+    assert found.count == len(body.surface.points)
     with pytest.raises(ConfigError, match="1 of 1 points lie outside"):
         attach(builder, soft, body, points=[[0.0, 0.0, 0.05]])

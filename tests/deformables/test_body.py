@@ -20,6 +20,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from softmode.deformables.body.records import BodyCubature
 from softmode.deformables.body.reduced_body import FORMAT_VERSION, ReducedBody
 from softmode.deformables.body.regions import Region
 from softmode.deformables.quadrature.quadrature import (
@@ -88,8 +89,8 @@ def test_affine_closure(default) -> None:
     """x(X) = A X + t to 1e-10 of the size for 100 random maps, inside, on the surface, and far outside; F = A."""
     quadrature, body = default
     rng = np.random.default_rng(1)
-    far = 10.0 * body.surface_points
-    points = np.concatenate([quadrature.points - body.offset, body.surface_points, far])
+    far = 10.0 * body.surface.points
+    points = np.concatenate([quadrature.points - body.offset, body.surface.points, far])
     value, gradient = body.evaluate(points)
     for _ in range(100):
         matrix, shift = rng.normal(size=(3, 3)), rng.normal(size=3)
@@ -98,10 +99,10 @@ def test_affine_closure(default) -> None:
         assert np.abs(points + value @ q - (points @ matrix.T + shift)).max() < 1e-10 * size
         deformation = np.eye(3) + np.einsum("ki,pkj->pij", q, gradient)
         assert np.abs(deformation - matrix).max() < 1e-10
-    stored = np.eye(3) + np.einsum("ki,pkj->pij", body.affine(matrix, shift), body.grad_basis)
+    stored = np.eye(3) + np.einsum("ki,pkj->pij", body.affine(matrix, shift), body.cubature.grad_basis)
     assert np.abs(stored - matrix).max() < 1e-5, "float32 storage"
-    surface = body.surface_points + body.surface_basis @ body.affine(matrix, shift)
-    assert np.abs(surface - (body.surface_points @ matrix.T + shift)).max() < 1e-6 * size
+    surface = body.surface.points + body.surface.basis @ body.affine(matrix, shift)
+    assert np.abs(surface - (body.surface.points @ matrix.T + shift)).max() < 1e-6 * size
 
 
 def test_linear_coordinates(default) -> None:
@@ -115,7 +116,7 @@ def test_linear_coordinates(default) -> None:
 
 def test_gradients_match_finite_differences(body: ReducedBody) -> None:
     """Grad b_k by central differences of step 1e-6 L, to 1e-6 of the largest gradient."""
-    points = body.points[::5]
+    points = body.cubature.points[::5]
     _, gradient = body.evaluate(points)
     step = 1e-6 * body.length
     for d in range(3):
@@ -138,8 +139,8 @@ def test_volume_counts_and_shapes(default) -> None:
     """
     quadrature, body = default
     body.check()
-    assert body.weights.sum() == pytest.approx(quadrature.volume, rel=1e-12)
-    assert (body.weights > 0.0).all()
+    assert body.cubature.weights.sum() == pytest.approx(quadrature.volume, rel=1e-12)
+    assert (body.cubature.weights > 0.0).all()
     assert body.point_count == BuildOptions().cubature_count
     assert body.surface_count == len(quadrature.surface_points)
     assert body.mode_count == 48  # of the space, out of whose quadratic handles the functions are chosen
@@ -182,8 +183,8 @@ def test_density_moves_the_frame(uneven: ReducedBody, quadrature: Quadrature) ->
 def test_stiffness_field_reaches_the_points(uneven: ReducedBody, quadrature: Quadrature) -> None:
     """Cubature points carry the relative modulus of the quadrature point they are."""
     body, stiff = uneven, FIELDS["stiffness_scale"](quadrature.points)
-    index = np.array([np.abs(quadrature.points - body.offset - p).sum(axis=1).argmin() for p in body.points])
-    np.testing.assert_array_equal(body.stiffness_scale, stiff[index])
+    index = np.array([np.abs(quadrature.points - body.offset - p).sum(axis=1).argmin() for p in body.cubature.points])
+    np.testing.assert_array_equal(body.cubature.stiffness_scale, stiff[index])
 
 
 def test_fields_may_be_functions_of_position(uneven: ReducedBody, quadrature: Quadrature) -> None:
@@ -243,10 +244,10 @@ def test_evaluate_outside(body: ReducedBody) -> None:
     """Beyond reach the non-affine functions are constant along rays, or refused; NaN is refused."""
     far = np.array([[0.0, 0.0, 0.2], [0.0, 0.0, 0.4]])
     value, gradient = body.evaluate(far)
-    assert not body.covers(far).any() and body.covers(body.points).all()
+    assert not body.covers(far).any() and body.covers(body.cubature.points).all()
     # kernels sit inside: at a pole of the capsule a sample may lie just beyond them
-    assert body.raw.reach(body.surface_points)[0].max() < 1.02
-    inside = np.abs(body.evaluate(body.surface_points)[0]).max()
+    assert body.raw.reach(body.surface.points)[0].max() < 1.02
+    inside = np.abs(body.evaluate(body.surface.points)[0]).max()
     assert np.abs(value[:, 4:]).max() < 4.0 * inside
     assert not gradient[:, 4:].any()
     with pytest.raises(BasisError, match="2 of 2 lie outside"):
@@ -578,6 +579,7 @@ def test_fields_that_are_none_are_refused(body: ReducedBody, field) -> None:
     """By name, before anything is solved; too few cubature points are refused too."""
     with pytest.raises(ConfigError, match="field: expected finite vectors"):
         body.project(field)
-    few = dataclasses.replace(body, points=body.points[:5], weights=body.weights[:5], grad_basis=body.grad_basis[:5])
+    first = {f.name: getattr(body.cubature, f.name)[:5] for f in dataclasses.fields(body.cubature)}
+    few = dataclasses.replace(body, cubature=BodyCubature(**first))
     with pytest.raises(BasisError, match="5 cubature points tell 5 of"):
         few.project(lambda X: X)

@@ -142,6 +142,6 @@ def test_tables() -> None:
     thin = sheet()
     for samples, weights in neighbourhoods(thin):
         assert weights.sum() == pytest.approx(CARRIED) and (weights > 0.0).all()
-        assert np.ptp(thin.surface_normals[samples] @ thin.surface_normals[samples[0]]) <= 1.5
+        assert np.ptp(thin.surface.normals[samples] @ thin.surface.normals[samples[0]]) <= 1.5
     assert sample_room(thin, 0.01) > 1.5 * thin.surface_count
     assert sample_room(cube(), 0.01) == cube().surface_count

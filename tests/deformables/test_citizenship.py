@@ -200,7 +200,7 @@ def test_masked_reset(kind):
     np.testing.assert_array_equal(run.q()[n : 2 * n], first[n : 2 * n])
     np.testing.assert_array_equal(np.delete(run.q().reshape(3, n, 3), 1, 0), np.delete(moved.reshape(3, n, 3), 1, 0))
     after = run.states[0].particle_q.numpy().reshape(3, -1, 3)
-    np.testing.assert_allclose(after[1], cube().surface_points, atol=1e-6)
+    np.testing.assert_allclose(after[1], cube().surface.points, atol=1e-6)
     np.testing.assert_array_equal(after[[0, 2]], particles[[0, 2]])
     run.solver.reset(run.states[0])
     np.testing.assert_array_equal(run.q(), first)

@@ -40,7 +40,7 @@ def test_mesh_contact_is_not_lost_when_deep():
     scene = on_shape(lambda world: world.add_shape_mesh(-1, mesh=mesh), height=0.05)
     scene.reduced.begin(scene.state, scene.control, scene.dt)
     scene.reduced.detect(scene.state, scene.control, scene.dt, prescribed=True)
-    bottom = cube().surface_points[:, 2] < -0.49 * EDGE
+    bottom = cube().surface.points[:, 2] < -0.49 * EDGE
     assert scene.reduced.view.constraints.count.numpy()[0] >= bottom.sum()
 
 
@@ -163,10 +163,10 @@ def test_stiffness_and_size_of_the_penalty():
     pressure = scene.mass() * GRAVITY / EDGE**2
     p = np.sqrt(2 * eps * pressure / kappa)
     p = p if p < eps else pressure / kappa + eps / 2
-    bottom = scene.body().surface_normals[:, 2] < -0.9
+    bottom = scene.body().surface.normals[:, 2] < -0.9
     depth = -scene.state.particle_q.numpy()[bottom, 2].astype(float)
     # E = 10 MPa is stiff but not rigid, and the areas of the samples sum to the face's only on average.
-    areas, dents = scene.body().surface_areas[bottom], scene.state.softmode.dent.numpy()[bottom, 2]
+    areas, dents = scene.body().surface.areas[bottom], scene.state.softmode.dent.numpy()[bottom, 2]
     assert np.average(depth + dents, weights=areas) + 0.35 * eps == pytest.approx(p, rel=0.1)
     assert 0.0 < ratio < 0.02 * 30.0 and np.abs(dents).max() < 0.3 * p
 
@@ -198,7 +198,7 @@ def test_automatic_stiffness_follows_the_parameters(dt):
 @pytest.mark.parametrize("count", [1, 2], ids=["ground", "pair"])
 def test_automatic_stiffness_is_that_of_the_touching_part(count):
     """A cube whose half is ten times as stiff touches with kappa(E) there and kappa(10 E) here; in pairs in series."""
-    jump = np.where(cube().points[:, 0] < 0.0, 1.0, 10.0)
+    jump = np.where(cube().cubature.points[:, 0] < 0.0, 1.0, 10.0)
     body = dataclasses.replace(cube(), stiffness_scale=jump, fingerprint="a cube of two halves")
     material, dt = Material(youngs_modulus=1.0e6), 0.02
 
@@ -214,7 +214,7 @@ def test_automatic_stiffness_is_that_of_the_touching_part(count):
     row = entries.row.numpy() if count == 2 else entries.partner_row.numpy()
     row = row[0, touching]
     ratio = entries.stiffness.numpy()[0, touching][own] / basis.row_area.numpy()[row[own]]
-    x, clear = body.surface_points[row[own], 0], np.abs(body.surface_points[row[own], 0]) > 0.2 * EDGE
+    x, clear = body.surface.points[row[own], 0], np.abs(body.surface.points[row[own], 0]) > 0.2 * EDGE
     assert (x[clear] < 0.0).any() and (x[clear] > 0.0).any()
     for side, factor in ((x < 0.0, 1.0), (x > 0.0, 10.0)):
         part = dataclasses.replace(material, youngs_modulus=factor * material.youngs_modulus)

@@ -109,7 +109,9 @@ def test_soft_modes_of_a_thin_held_plate() -> None:
     full, few = (
         elastic_modes(
             reduced_stiffness(
-                body.grad_basis[:, body.driven_count :].astype(np.float64).transpose(1, 2, 0), body.weights, 0.4
+                body.cubature.grad_basis[:, body.driven_count :].astype(np.float64).transpose(1, 2, 0),
+                body.cubature.weights,
+                0.4,
             )
         )[0][:12]
         for body in bodies
@@ -175,7 +177,7 @@ def test_the_best_trial_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
         body = build_body(quadrature_from_box((0.06, 0.05, 0.04), point_count=800), options, progress=False)
     assert len(errors) == 4 and min(errors) < errors[-1]
     assert body.provenance["cubature_force_error"] == min(errors)
-    assert len(body.points) > 48
+    assert len(body.cubature.points) > 48
 
 
 def test_all_points_and_bad_input(full) -> None:
@@ -222,7 +224,7 @@ def test_poses_and_points_are_added_where_forces_want_them() -> None:
     more = build(384, 0.9 * left)
     assert asked.point_count == 384 and more.point_count in (384, 576, 768)
     assert float(str(more.provenance["cubature_force_error"])) <= 0.9 * left
-    assert not (more.point_count == 384 and np.array_equal(more.points, asked.points))
-    assert abs(more.weights.sum() / more.volume - 1.0) < 1e-12
+    assert not (more.point_count == 384 and np.array_equal(more.cubature.points, asked.cubature.points))
+    assert abs(more.cubature.weights.sum() / more.volume - 1.0) < 1e-12
     with pytest.raises(ConfigError, match="cubature_error"):
         BuildOptions(cubature_error=0.0)

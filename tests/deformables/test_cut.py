@@ -86,7 +86,7 @@ def test_mass_and_momentum_are_conserved(bar: ReducedBody, halves: tuple[Reduced
     np.testing.assert_allclose([part.volume / bar.volume for part in halves], [0.565, 0.435], atol=2e-3)
     centre = sum(part.volume * part.offset for part in halves) / bar.volume
     np.testing.assert_allclose(centre, bar.offset, atol=1e-12)
-    added = sum(part.surface_areas.sum() for part in halves) - bar.surface_areas.sum()
+    added = sum(part.surface.areas.sum() for part in halves) - bar.surface.areas.sum()
     assert added == pytest.approx(2.0 * SIZE[1] * SIZE[2] * np.linalg.norm((1.0, 0.3, -0.1)), rel=0.02)
     q, qd = motion(bar)
     moved = [carry_over(bar, part, q, qd) for part in halves]
@@ -121,8 +121,8 @@ def test_fields_go_with_their_part() -> None:
         after, heavy.volume * heavy.mean_basis @ qd, atol=1e-9 * heavy.volume * np.linalg.norm(qd)
     )
     for part in cut.bodies:
-        stiff = np.where(part.points[:, 0] + part.offset[0] > 0.0, 8.0, 1.0)
-        np.testing.assert_array_equal(part.stiffness_scale, stiff)
+        stiff = np.where(part.cubature.points[:, 0] + part.offset[0] > 0.0, 8.0, 1.0)
+        np.testing.assert_array_equal(part.cubature.stiffness_scale, stiff)
 
 
 def world(parts: tuple[ReducedBody, ...], origin: NDArray[np.float64], pinned: int | None = None) -> Any:
@@ -132,7 +132,7 @@ def world(parts: tuple[ReducedBody, ...], origin: NDArray[np.float64], pinned: i
         position = part.offset - origin
         instance = add_reduced_body(builder, part, material=MATERIAL, position=tuple(position.tolist()))
         if number == pinned:
-            x = part.surface_points
+            x = part.surface.points
             end = x[x[:, 0] < x[:, 0].min() + 1e-6]
             add_pins(builder, instance, end, targets=end + position, stiffness=1e3)
     return builder.finalize(device="cpu")
@@ -182,7 +182,7 @@ def test_where_the_body_is(bar: ReducedBody) -> None:
     cut = cut_body(bar, Patch.plane(point, normal), q)
     sides = []
     for part in cut.bodies:
-        X = part.surface_points + part.offset - bar.offset
+        X = part.surface.points + part.offset - bar.offset
         level = (X + bar.evaluate(X)[0] @ q - point) @ normal
         sides.append(np.sign(np.median(level)))
         assert (sides[-1] * level > -1e-3 * SIZE[0]).all()
@@ -215,13 +215,17 @@ def test_a_slit_opens(bar: ReducedBody) -> None:
     cut = cut_body(bar, SLIT)
     (slit,) = cut.bodies
     assert "slit" in cut.notes[0] and abs(slit.volume / bar.volume - 1.0) < 1e-12
-    assert len(slit.hidden_pairs) and slit.surface_areas.sum() > bar.surface_areas.sum() + 2.0 * 0.07 * SIZE[2]
+    assert (
+        len(slit.flat()["hidden_pairs"]) and slit.surface.areas.sum() > bar.surface.areas.sum() + 2.0 * 0.07 * SIZE[2]
+    )
     lips = np.array([[0.095, side * 0.004, 0.0] for side in (-1.0, 1.0)])
 
     def opening(body: ReducedBody) -> float:
         """Return how far the lips part under forces of their own, statically and linearly [m/N]."""
         n = body.function_count
-        stiffness = reduced_stiffness(body.grad_basis.astype(np.float64).transpose(1, 2, 0), body.weights, 0.3)
+        stiffness = reduced_stiffness(
+            body.cubature.grad_basis.astype(np.float64).transpose(1, 2, 0), body.cubature.weights, 0.3
+        )
         rows = body.evaluate(lips - body.offset)[0]
         load = np.zeros(3 * n)
         load[n : 2 * n] = rows[1] - rows[0]
@@ -232,7 +236,9 @@ def test_a_slit_opens(bar: ReducedBody) -> None:
     across = cut_body(slit, Patch.plane((0.05, 0.0, 0.0), (1.0, 0.0, 0.0)))
     assert len(across.bodies) == 3
     np.testing.assert_allclose([part.volume / bar.volume for part in across.bodies], [0.75, 0.125, 0.125], atol=0.01)
-    assert len(across.bodies[0].hidden_pairs) and not any(len(part.hidden_pairs) for part in across.bodies[1:])
+    assert len(across.bodies[0].flat()["hidden_pairs"]) and not any(
+        len(part.flat()["hidden_pairs"]) for part in across.bodies[1:]
+    )
 
 
 @pytest.mark.rest
@@ -245,7 +251,9 @@ def test_lips_have_handles_of_their_own(bar: ReducedBody, monkeypatch: pytest.Mo
     (slit,) = cut_body(bar, SLIT).bodies
     cells = unpack_sources(slit).quadrature.cells
     lips = lips_of(cells) - slit.offset
-    weights = slit.kernels.evaluate(lips).value @ gather_at_lips(slit.kernels, lips, basis.LIP_COUNT)
+    weights = slit.reproducing_kernels.evaluate(lips).value @ gather_at_lips(
+        slit.reproducing_kernels, lips, basis.LIP_COUNT
+    )
     away = lips[:, 0] > 0.08
     upper, lower = weights[away & (lips[:, 1] > 0.0)], weights[away & (lips[:, 1] < 0.0)]
     assert np.minimum(upper.max(axis=0), lower.max(axis=0)).max() < 0.03
@@ -279,9 +287,9 @@ def test_prongs_that_touch_do_not_grow_together() -> None:
         return bent
 
     q = fork.affine(np.eye(3)) + fork.project(close)
-    tips = fork.surface_points[:, 2] > fork.bounds[1, 2] - 0.005
-    x = (fork.surface_points + fork.surface_basis @ q)[tips, 0]
-    left = fork.surface_points[tips, 0] < middle[0]
+    tips = fork.surface.points[:, 2] > fork.bounds[1, 2] - 0.005
+    x = (fork.surface.points + fork.surface.basis @ q)[tips, 0]
+    left = fork.surface.points[tips, 0] < middle[0]
     assert x[left].max() > x[~left].min()
     cut = cut_body(fork, Patch.plane((0.0, 0.0, middle[2]), (0.0, 0.0, 1.0)), q)
     assert len(cut.bodies) == 3
@@ -293,7 +301,7 @@ def test_a_patch_that_misses(bar: ReducedBody) -> None:
     """Nothing is built, and the cut says so."""
     cut = cut_body(bar, Patch.plane((1.0, 0.0, 0.0), (1.0, 0.0, 0.0)))
     assert cut.missed and cut.bodies == (bar,) and cut.notes == ("the patch misses 'bar': nothing is cut",)
-    assert (cut.owners(bar.surface_points) == 0).all() and np.isinf(cut.levels(bar.points)[0]).all()
+    assert (cut.owners(bar.surface.points) == 0).all() and np.isinf(cut.levels(bar.cubature.points)[0]).all()
 
 
 def test_crumbs_are_dropped(bar: ReducedBody) -> None:
@@ -315,7 +323,7 @@ def test_an_exact_region_goes_with_its_part(bar: ReducedBody) -> None:
     assert held.function_count == bar.function_count == 24
     qd = motion(held)[1]
     parts = cut_body(held, MIDDLE).bodies
-    assert [part.region_names for part in parts] == [("end",), ()]
+    assert [part.regions.names for part in parts] == [("end",), ()]
     after = sum(part.volume * part.mean_basis @ carry_over(held, part, 0.0 * qd, qd)[1] for part in parts)
     before = held.volume * held.mean_basis @ qd
     np.testing.assert_allclose(after, before, atol=1e-9 * np.linalg.norm(before))
@@ -329,7 +337,7 @@ def test_a_soft_region_is_cut_through(bar: ReducedBody) -> None:
     soft = Region(name="soft", box=((-0.03, -1.0, -1.0), (0.05, 1.0, 1.0)), stiffness=1e4)
     held = hold(bar, END, soft)
     cut = cut_body(held, MIDDLE)
-    assert [part.region_names for part in cut.bodies] == [("end", "soft"), ("soft",)]
+    assert [part.regions.names for part in cut.bodies] == [("end", "soft"), ("soft",)]
     qd = motion(held)[1]
     after = sum(part.volume * part.mean_basis @ carry_over(held, part, 0.0 * qd, qd)[1] for part in cut.bodies)
     before = held.volume * held.mean_basis @ qd

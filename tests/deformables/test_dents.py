@@ -182,7 +182,7 @@ def test_given_stiffness_has_no_dent() -> None:
 def test_wall() -> None:
     """Where a body is thin its wall bounds the dent: a share of a sheet's 4 mm, less than its functions resolve."""
     body = sheet()
-    face = np.abs(body.surface_normals[:, 2]) > 0.9
+    face = np.abs(body.surface.normals[:, 2]) > 0.9
     assert resolved_size(body) > 0.004
     np.testing.assert_allclose(dent_lengths(body)[face], DENT_FACTOR * WALL_SHARE * 0.004, rtol=0.02)
 
@@ -217,24 +217,24 @@ def test_weights() -> None:
     Points of the other side of a thin sheet do not count.
     """
     body = smooth_ball(8, 400)
-    found = dent_weights(body, body.surface_points)
+    found = dent_weights(body, body.surface.points)
     np.testing.assert_array_equal(found.samples[:, 0], np.arange(body.surface_count))
     np.testing.assert_allclose(
         found.weights, np.eye(1, found.weights.shape[1]).repeat(body.surface_count, 0), atol=1e-4
     )
     depth = 0.01
-    below = dent_weights(body, body.surface_points - depth * body.surface_normals).weights.sum(axis=1)
+    below = dent_weights(body, body.surface.points - depth * body.surface.normals).weights.sum(axis=1)
     np.testing.assert_allclose(below, np.exp(-depth / resolved_size(body)), rtol=0.02)
     thin = sheet()
-    top = (thin.surface_normals[:, 2] > 0.9) & (np.abs(thin.surface_points[:, :2]).max(axis=1) < 0.055)
-    found = dent_weights(thin, thin.surface_points[top] - [0.002, 0.001, 0.0])
-    assert (found.weights * (thin.surface_normals[found.samples, 2] < 0.9)).sum(axis=1).max() < 0.05
+    top = (thin.surface.normals[:, 2] > 0.9) & (np.abs(thin.surface.points[:, :2]).max(axis=1) < 0.055)
+    found = dent_weights(thin, thin.surface.points[top] - [0.002, 0.001, 0.0])
+    assert (found.weights * (thin.surface.normals[found.samples, 2] < 0.9)).sum(axis=1).max() < 0.05
 
 
 def test_exact_regions_do_not_dent() -> None:
     """Samples of an exact region, which no free function moves, have no dent; all others have."""
     body = held_bar()
-    held = np.abs(body.surface_basis[:, body.driven_count :]).max(axis=1) < 1e-9
+    held = np.abs(body.surface.basis[:, body.driven_count :]).max(axis=1) < 1e-9
     assert 0 < held.sum() < body.surface_count
     np.testing.assert_array_equal(dent_lengths(body) == 0.0, held)
 
@@ -275,7 +275,7 @@ def test_soft_bodies_share_their_dents() -> None:
     press.scene.set_parameter("youngs_modulus", (1.0e6, 4.0e6))
     press.force(0.02 * RADIUS)
     dent = press.scene.state.softmode.dent.numpy().reshape(2, -1, 3)
-    middle = [abs(press.scene.body().surface_points[:, 2] - side * RADIUS) < 0.3 * RADIUS for side in (1, -1)]
+    middle = [abs(press.scene.body().surface.points[:, 2] - side * RADIUS) < 0.3 * RADIUS for side in (1, -1)]
     soft, stiff = (np.abs(dent[k, middle[k], 2]) for k in range(2))
     assert soft.max() == pytest.approx(4.0 * stiff.max(), rel=0.3)
     assert (dent[0, middle[0], 2] <= 0.0).all() and (dent[1, middle[1], 2] >= 0.0).all()

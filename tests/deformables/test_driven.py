@@ -32,14 +32,16 @@ def scene_of(body, **options):
 def region_positions(scene, name):
     """Return where the points of a region are [m]."""
     body = scene.body()
-    rows = body.region_rows(name)
-    return body.region_points[rows] + body.evaluate(body.region_points[rows])[0] @ scene.q(), body.region_points[rows]
+    rows = body.regions.rows(name)
+    return body.regions.points[rows] + body.evaluate(body.regions.points[rows])[0] @ scene.q(), body.regions.points[
+        rows
+    ]
 
 
 def test_exact_regions_have_no_dents():
     """Samples of an exact region are where they are driven to; all others may be dented."""
     body = held_bar()
-    lengths, held = dent_lengths(body), body.surface_points[:, 0] < -0.5 * LENGTH + 0.05 - 1e-9
+    lengths, held = dent_lengths(body), body.surface.points[:, 0] < -0.5 * LENGTH + 0.05 - 1e-9
     assert held.sum() > 10 and not lengths[held].any() and (lengths[~held] > 0.0).all()
 
 
@@ -77,7 +79,7 @@ def test_exact_region_stays_put():
     assert np.linalg.norm(scene.qd()) < 1e-6
     reaction = from_blocks(scene.reduced.reaction.numpy()[0], body.function_count)
     assert not reaction[body.driven_count :].any()
-    force = body.drive_affine[0][:, 3] @ reaction[: body.driven_count]
+    force = body.regions.drive_affine[0][:, 3] @ reaction[: body.driven_count]
     np.testing.assert_allclose(force, [0.0, 0.0, scene.mass() * GRAVITY], atol=1e-5 * scene.mass() * GRAVITY)
 
 
@@ -123,9 +125,9 @@ def test_soft_region_is_held_by_its_pins():
 
     scene = Scene(populate, [body], gravity=DOWN, options=FINE, dt=0.02)
     scene.step(200)
-    rows = body.region_rows("left")
+    rows = body.regions.rows("left")
     x, X = region_positions(scene, "left")
-    force = -1.0e3 * 2.0e5 * body.region_weights[rows] @ (x - X)
+    force = -1.0e3 * 2.0e5 * body.regions.weights[rows] @ (x - X)
     np.testing.assert_allclose(force, [0.0, 0.0, scene.mass() * GRAVITY], atol=1e-3 * scene.mass() * GRAVITY)
 
 

@@ -66,7 +66,7 @@ def bodies() -> dict[int, ReducedBody]:
 
 def test_functions_are_nested(bodies: dict[int, ReducedBody]) -> None:
     """The functions of a smaller count are the first of a larger one."""
-    points = bodies[80].points[::7]
+    points = bodies[80].cubature.points[::7]
     most = bodies[80].evaluate(points)[0]
     for count, body in bodies.items():
         np.testing.assert_allclose(body.evaluate(points)[0], most[:, :count], atol=1e-8 * np.abs(most).max())
@@ -150,7 +150,7 @@ def test_the_space_grows_where_it_must() -> None:
     assert float(str(body.provenance["space_functions"])) > wide
     assert SPACE_ERROR < float(str(body.provenance["space_error"])) < 0.2
     fewer = build_body(quadrature, dataclasses.replace(options, function_count=24), progress=False)
-    both = np.concatenate([body.evaluate(body.points)[0], fewer.evaluate(body.points)[0]], axis=1)
+    both = np.concatenate([body.evaluate(body.cubature.points)[0], fewer.evaluate(body.cubature.points)[0]], axis=1)
     assert np.linalg.matrix_rank(both, tol=1e-7 * np.linalg.norm(both, 2)) == body.function_count  # Still nested.
 
 
@@ -167,7 +167,7 @@ def test_defaults_and_determinism() -> None:
     first, again = built(), built.__wrapped__()
     assert first.function_count == FUNCTION_COUNT
     np.testing.assert_array_equal(first.transform, again.transform)
-    np.testing.assert_array_equal(first.grad_basis, again.grad_basis)
+    np.testing.assert_array_equal(first.cubature.grad_basis, again.cubature.grad_basis)
 
 
 @pytest.mark.rest
@@ -212,7 +212,7 @@ def test_functions_of_held_bodies_are_nested(regions: tuple[Region, ...]) -> Non
     few, many = held(24, regions), held(40, regions)
     exact = sum(region.stiffness is None for region in regions)
     assert few.driven_count == many.driven_count == 4 * exact
-    points = many.points[::3]
+    points = many.cubature.points[::3]
     less, more = few.evaluate(points)[0], many.evaluate(points)[0]
     free = slice(few.driven_count, 24)
     np.testing.assert_allclose(less[:, free], more[:, free], atol=1e-7 * np.abs(more).max())
@@ -226,8 +226,8 @@ def test_held_bodies_know_their_response() -> None:
     for count in (13, 80):
         body = held(count)
         r, n = body.driven_count, body.function_count - body.driven_count
-        slope = body.grad_basis[:, r:].astype(float).transpose(1, 2, 0)
-        stiffness = reduced_stiffness(slope, body.weights * body.stiffness_scale, 0.4)
+        slope = body.cubature.grad_basis[:, r:].astype(float).transpose(1, 2, 0)
+        stiffness = reduced_stiffness(slope, body.cubature.weights * body.cubature.stiffness_scale, 0.4)
         force = np.kron([[0.0], [0.0], [1.0]], body.mean_basis[r:, None]).ravel()
         assert len(stiffness) == 3 * n
         work.append(force @ np.linalg.solve(stiffness, force))

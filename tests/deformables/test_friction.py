@@ -328,7 +328,7 @@ def test_world_of_three_equals_single_world():
         batch.set(qd=qd, instance=i)
         starts.append((batch.q(i), qd))
     batch.step(30)
-    samples = len(batch.body().surface_points)
+    samples = len(batch.body().surface.points)
     for i, (q, qd) in enumerate(starts):
         alone = incline(0.9)[0]
         alone.set(q=q, qd=qd)

@@ -50,7 +50,7 @@ class GripScene(Scene):
 
     def points(self, side, count=6):
         """Return rest points of the surface on one side of the cube along z."""
-        X = cube().surface_points
+        X = cube().surface.points
         return X[np.argsort(-side * X[:, 2])[:count]]
 
 
@@ -59,7 +59,7 @@ def test_a_pull_adds_its_force_times_dt_to_the_momentum(coupled):
     """A free body pulled at a point gains dt (f + m g): to 2e-6 of dt |f|, the rounding of float32 rows."""
     scene = GripScene(coupled=coupled, gravity=DOWN, options=TIGHT)
     grips = scene.grips[0]
-    number = grips.take(cube().surface_points[3:4], scene.state, pulls=True)
+    number = grips.take(cube().surface.points[3:4], scene.state, pulls=True)
     grips.aim(number, grips.pose(number)[0] + np.array([0.03, -0.02, 0.05]))
     weight = scene.mass() * np.array(DOWN)
     for _ in range(20):
@@ -74,9 +74,9 @@ def test_a_pull_adds_its_force_times_dt_to_the_momentum(coupled):
 def test_a_pull_is_a_spring_and_moves_what_a_constant_force_does():
     """At rest the force is k (t - x), and displaces the held cube as the same constant force on that sample does."""
     scene = GripScene(material=DAMPED, dt=0.02)
-    grips, sample = scene.grips[0], int(np.argmax(cube().surface_points[:, 2]))
+    grips, sample = scene.grips[0], int(np.argmax(cube().surface.points[:, 2]))
     grips.take(scene.points(-1, 12), scene.state)
-    pull = grips.take(cube().surface_points[sample : sample + 1], scene.state, pulls=True)
+    pull = grips.take(cube().surface.points[sample : sample + 1], scene.state, pulls=True)
     start = grips.points(pull, scene.state)[0]
     goal = start + np.array([0.01, 0.0, 0.005])
     grips.aim(pull, goal)
@@ -154,7 +154,7 @@ def test_let_go_leaves_nothing_behind():
     scene, plain = GripScene(gravity=DOWN), GripScene(gravity=DOWN, slots=0)
     grips = scene.grips[0]
     number = grips.take(scene.points(1), scene.state)
-    pull = grips.take(cube().surface_points[:1], scene.state, pulls=True)
+    pull = grips.take(cube().surface.points[:1], scene.state, pulls=True)
     grips.aim(pull, (0.3, 0.2, 1.1))
     scene.step(10)
     grips.let_go(number)
@@ -230,7 +230,7 @@ def test_errors():
     scene = GripScene(slots=8)
     grips = scene.grips[0]
     with pytest.raises(ConfigError, match="no room for a grip of 9 points"):
-        grips.take(cube().surface_points[:9], scene.state)
+        grips.take(cube().surface.points[:9], scene.state)
     for wrong in ([[0.0, 0.0]], [[np.nan, 0.0, 0.0]], np.zeros((0, 3))):
         with pytest.raises(ConfigError, match="rest_points"):
             grips.take(wrong, scene.state)
@@ -243,7 +243,7 @@ def test_errors():
     world = newton.ModelBuilder()
     instance = add_reduced_body(world, cube())
     add_grip_slots(world, instance, 2)
-    add_pins(world, instance, cube().surface_points[:1], stiffness=1.0)
+    add_pins(world, instance, cube().surface.points[:1], stiffness=1.0)
     with pytest.raises(ConfigError, match="no slots"):
         Grips(SolverReduced(world.finalize(device="cpu"), [cube()]), instance, slot_count=2)
     with pytest.raises(ConfigError, match="has 0 pins, not 9 slots"):

@@ -62,7 +62,7 @@ def test_is_the_body_that_was_told(free, held, quadrature, scales, tmp_path):
     told = build_body(quadrature, OPTIONS, name="bar", regions=(END, OTHER), **scales)
     held.save(tmp_path / "bar.npz")
     again = hold(ReducedBody.load(tmp_path / "bar.npz"), OTHER)
-    assert again.region_names == ("end", "other") and told.fingerprint == again.fingerprint
+    assert again.regions.names == ("end", "other") and told.fingerprint == again.fingerprint
     for field in dataclasses.fields(told):
         a, b = getattr(told, field.name), getattr(again, field.name)
         if isinstance(a, np.ndarray):
@@ -90,7 +90,7 @@ def test_affine_motion_goes_over(free, held):
     rng = np.random.default_rng(0)
     A, t, B, v = rng.normal(size=(3, 3)), rng.normal(size=3), rng.normal(size=(3, 3)), rng.normal(size=3)
     q, qd = carry_over(free, held, free.affine(A, t), free.affine(np.eye(3) + B, v))
-    X, before = held.surface_points, held.surface_points + held.offset - free.offset
+    X, before = held.surface.points, held.surface.points + held.offset - free.offset
     np.testing.assert_allclose(X + held.evaluate(X)[0] @ q, before @ A.T + t, atol=1e-9)
     np.testing.assert_allclose(held.evaluate(X)[0] @ qd, before @ B.T + v, atol=1e-9)
 
@@ -139,7 +139,7 @@ def solver_of(body, points):
 
 def test_pins_that_the_build_was_not_told_of(free, held):
     """Pins on an end warn by the body's name; not where the build knew, nor at single points."""
-    end = free.surface_points[free.surface_points[:, 0] < -0.085]
+    end = free.surface.points[free.surface.points[:, 0] < -0.085]
     with pytest.warns(UserWarning, match=r"'bar'.*hold\(body"):
         solver_of(free, end)
     with warnings.catch_warnings():

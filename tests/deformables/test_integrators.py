@@ -38,7 +38,7 @@ def test_step_of_a_spring(dt, printed):
     def populate(world):
         material = Material(youngs_modulus=1.0e6, viscosity=0.0, density=1.0 / body.volume)
         instance = add_reduced_body(world, body, material=material, position=(1.0, 0.0, 0.0))
-        add_pins(world, instance, body.points, stiffness=k * body.weights / body.volume)
+        add_pins(world, instance, body.cubature.points, stiffness=k * body.cubature.weights / body.volume)
 
     scene = Scene(populate, [body], options=SolverReducedOptions(tolerance=1.0e-9), dt=dt)
     scene.step()

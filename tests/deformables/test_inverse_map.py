@@ -74,7 +74,7 @@ def test_places_have_dents():
     With the true step to 0.05 mm. A map that knows nothing of the dent is off by 0.5 mm, both ways.
     """
     q, body = coordinates(*DEFORMED["bent"]), long_bar()
-    samples = body.surface_points
+    samples = body.surface.points
     near = np.exp(-((samples - [0.1, 0.0, 0.1]) ** 2).sum(axis=1) / 0.15**2) * (samples[:, 2] > 0.09)
     dent = (4e-3 * near[:, None] * [0.3, 0.0, -1.0]).astype(np.float32)
     rest, moved = places(q)

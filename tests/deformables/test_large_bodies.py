@@ -32,8 +32,8 @@ def scene_of(*counts: int, device: str = "cpu", worlds: int = 1) -> Scene:
     def populate(world: newton.ModelBuilder) -> None:
         for level, body in enumerate(bodies):
             instance = add_reduced_body(world, body, position=(0.0, 0.0, 0.3 * level + 0.051))
-            held = body.points[:, 0] < body.bounds[0, 0] + 0.03
-            add_pins(world, instance, body.points[held], stiffness=1.0e9 * body.weights[held])
+            held = body.cubature.points[:, 0] < body.bounds[0, 0] + 0.03
+            add_pins(world, instance, body.cubature.points[held], stiffness=1.0e9 * body.cubature.weights[held])
 
     given = {"gravity": (0.0, 0.0, -GRAVITY), "device": device, "world_count": worlds}
     scene = Scene(populate, bodies, **given)

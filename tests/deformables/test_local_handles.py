@@ -80,7 +80,7 @@ def held() -> ReducedBody:
 def test_weights_sum_to_one(body: ReducedBody, hand: ReducedBody) -> None:
     """Beside the constant handle: none is large or negative, all sum to one, and each of many vanishes somewhere."""
     for one, count in ((body, 6), (hand, 24)):
-        weight, gradient = one.skinning_weights(np.concatenate([one.points, one.surface_points]))
+        weight, gradient = one.skinning_weights(np.concatenate([one.cubature.points, one.surface.points]))
         assert weight.shape[1] == count + 1 and one.mode_count == count
         np.testing.assert_allclose(weight[:, 1:].sum(axis=1), 1.0, atol=1e-12)
         np.testing.assert_allclose(gradient[:, 1:].sum(axis=1), 0.0, atol=1e-9)
@@ -91,8 +91,8 @@ def test_weights_sum_to_one(body: ReducedBody, hand: ReducedBody) -> None:
 def test_functions_are_all_of_the_handles(body: ReducedBody) -> None:
     """Ten monomials for each, orthonormal in mass, and affine motion is exact."""
     assert 54 <= body.function_count <= 60
-    value = body.evaluate(body.points)[0]
-    gram = (value.T * body.weights) @ value / body.volume
+    value = body.evaluate(body.cubature.points)[0]
+    gram = (value.T * body.cubature.weights) @ value / body.volume
     np.testing.assert_allclose(gram, np.eye(len(gram)), atol=1e-9)
     rng = np.random.default_rng(0)
     X, A, t = rng.uniform(*body.bounds, (50, 3)), rng.normal(size=(3, 3)), rng.normal(size=3)
@@ -127,10 +127,10 @@ def test_pull_of_a_held_cube() -> None:
 def test_regions_hold_exactly(held: ReducedBody) -> None:
     """Free functions vanish on an exact region, the others carry its affine motion."""
     body = chosen(30)
-    inside = held.region_points
+    inside = held.regions.points
     assert np.abs(held.evaluate(inside)[0][:, held.driven_count :]).max() < 1e-9
     q, qd = carry_over(body, held, body.affine(2.0 * np.eye(3)), np.zeros((body.function_count, 3)))
-    X = held.surface_points
+    X = held.surface.points
     np.testing.assert_allclose(held.evaluate(X)[0] @ q, X + held.offset - body.offset, atol=1e-9)
     assert np.abs(qd).max() < 1e-12
 

@@ -186,7 +186,7 @@ def test_particles_of_worlds_that_differ():
     assert len(x) == sum(scene.body(i).surface_count for i in range(4))
     for i in range(4):
         body = scene.body(i)
-        expected = body.surface_points + body.surface_basis.astype(float) @ scene.q(i)
+        expected = body.surface.points + body.surface.basis.astype(float) @ scene.q(i)
         np.testing.assert_allclose(x[start[i] : start[i] + body.surface_count], expected, atol=1e-6)
 
 

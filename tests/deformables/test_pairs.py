@@ -174,7 +174,7 @@ def test_gap_of_spheres_is_of_second_order():
         assert len(rows) > 2
         centres = [scene.centre(i) for i in range(2)]
         surfaces = [surface(scene, i) for i in range(2)]
-        radius = np.linalg.norm(body.surface_points, axis=1).mean()
+        radius = np.linalg.norm(body.surface.points, axis=1).mean()
         error = [gap - (np.linalg.norm(surfaces[i].points[s] - centres[j]) - radius) for i, s, j, gap, *_ in rows]
         errors.append(np.sqrt(np.mean(np.square(error))))
         spacings.append(surfaces[0].spacing)
@@ -556,14 +556,14 @@ def test_thin_sheet_holds_a_ball(speed, dt):
 
     def populate(world):
         i = add_reduced_body(world, body, material=Material(youngs_modulus=1.0e6))
-        attach(world, i, body, points=body.surface_points[np.abs(body.surface_points[:, 0]) > 0.05])
+        attach(world, i, body, points=body.surface.points[np.abs(body.surface.points[:, 0]) > 0.05])
         add_reduced_body(world, ball(), position=(0.0, 0.0, 0.033), velocity=(0.0, 0.0, -speed))
 
     options = SolverReducedOptions(contact_max=512)
     scene = Scene(populate, [body, ball()], gravity=DOWN, dt=dt, options=options)
     for _ in range(round(0.4 / dt)):
         scene.step()
-        middle = surface(scene, 0).points[np.abs(surface(scene, 0).body.surface_points[:, :2]).max(axis=1) < 0.015]
+        middle = surface(scene, 0).points[np.abs(surface(scene, 0).body.surface.points[:, :2]).max(axis=1) < 0.015]
         assert scene.centre(1)[2] > middle[:, 2].min() + 0.02
     if speed == 0.0:
         weight = scene.mass(1) * GRAVITY
@@ -641,7 +641,7 @@ def test_squeezed_body_does_not_touch_its_far_side(height):
 
 def tips(scene):
     """Return the mean width of the opening of the ring [m]: between the samples of its two end faces."""
-    X, x = scene.body().surface_points, surface(scene, 0).points
+    X, x = scene.body().surface.points, surface(scene, 0).points
     end = (X[:, 0] > 0.03) & (np.abs(np.abs(X[:, 1]) - 0.01) < 0.002)
     return x[end & (X[:, 1] > 0.0), 1].mean() - x[end & (X[:, 1] < 0.0), 1].mean()
 
@@ -687,10 +687,10 @@ def shut_ring(dt, friction):
 
     scene = Scene(populate, [body], dt=dt)
     twin = reference.FreeBody(body=body, material=reference.with_float32(material), dt=dt)
-    X = body.surface_points
+    X = body.surface.points
     v = np.zeros_like(X)
     v[:, 1] = -np.sign(X[:, 1]) * 8.0 * np.clip((X[:, 0] + 0.05) / 0.1, 0.0, 1.0)
-    scene.set(qd=np.linalg.lstsq(body.surface_basis.astype(float), v, rcond=None)[0])
+    scene.set(qd=np.linalg.lstsq(body.surface.basis.astype(float), v, rcond=None)[0])
     p0, L0 = scene.momentum()
     e0, scale = scene.kinetic_energy(), scene.mass() * np.abs(v).max()
     out = []

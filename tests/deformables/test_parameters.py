@@ -100,7 +100,7 @@ def test_whatever_else_is_written_is_flagged_by_name(name, bad):
 
     def populate(world):
         index = add_reduced_body(world, cube(), position=(0.0, 0.0, 0.2))
-        add_pins(world, index, cube().points[:3], stiffness=20.0)
+        add_pins(world, index, cube().cubature.points[:3], stiffness=20.0)
         world.add_shape_box(-1, hx=0.05, hy=0.05, hz=0.05)
 
     scene = Scene(populate, [cube()], gravity=DOWN, world_count=2)
@@ -258,7 +258,7 @@ def test_held_bodies_keep_their_scale():
     """A pinned or driven body keeps its scale and is flagged where another is asked for; the rest is set."""
 
     def populate(world):
-        add_pins(world, add_reduced_body(world, cube()), cube().points[:3], stiffness=10.0)
+        add_pins(world, add_reduced_body(world, cube()), cube().cubature.points[:3], stiffness=10.0)
         add_reduced_body(world, clamped(), position=(1.0, 0.0, 0.0))
         add_reduced_body(world, cube(), position=(2.0, 0.0, 0.0))
 

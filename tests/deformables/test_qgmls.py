@@ -180,7 +180,7 @@ def test_body_has_the_functions_of_its_kernels(body: ReducedBody) -> None:
     weight = np.full(len(x), 1.0 / len(x))
     value = body.evaluate(x)[0]
     np.testing.assert_allclose((value.T * weight) @ value, np.eye(body.function_count), atol=1e-9)
-    own = BasisQGMLS(centres=body.centres, radii=body.radii).evaluate(x)[0]
+    own = BasisQGMLS(centres=body.kernels.centres, radii=body.kernels.radii).evaluate(x)[0]
     left = value - own @ np.linalg.lstsq(own, value, rcond=None)[0]
     assert np.abs(left).max() < 1e-7
     assert 60 < body.function_count <= 80

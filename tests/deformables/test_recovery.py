@@ -44,8 +44,8 @@ FLAT, MIRRORED, LINE, POINT = (np.diag(d) for d in ([1.0, 1.0, 0.0], [1.0, 1.0, 
 def deviation_from_rest(scene: Scene, instance: int) -> float:
     """Return the largest distance of a surface sample from the rest shape in its best rigid position [m]."""
     body = scene.body(instance)
-    X = body.surface_points
-    x = X + body.surface_basis.astype(float) @ scene.q(instance)
+    X = body.surface.points
+    x = X + body.surface.basis.astype(float) @ scene.q(instance)
     x, centred = x - x.mean(axis=0), X - X.mean(axis=0)
     R = reference.rotation(x.T @ centred)
     return float(np.linalg.norm(x - centred @ R.T, axis=1).max())

@@ -21,7 +21,7 @@ from softmode.deformables.reduction.build_body import build_body
 from softmode.deformables.reduction.options import BuildOptions
 from softmode.deformables.reduction.region_samples import pieces_near, refine_at_faces
 from softmode.errors import BasisError, ConfigError
-from tests.bodies import assert_same
+from tests.bodies import assert_same, changed
 from tests.oracle.solids import stiffness
 
 INF = np.inf
@@ -70,7 +70,7 @@ def body(request) -> ReducedBody:
 
 def exact_rows(body: ReducedBody) -> np.ndarray:
     """Return the rows of the region points that belong to exact regions."""
-    return np.flatnonzero(body.region_stiffness[body.region_index] == 0.0)
+    return np.flatnonzero(body.regions.stiffness[body.regions.index] == 0.0)
 
 
 def inner_points(region: Region, rng: np.random.Generator) -> np.ndarray:
@@ -82,17 +82,17 @@ def inner_points(region: Region, rng: np.random.Generator) -> np.ndarray:
 
 def affine_motion(body: ReducedBody, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return a random affine motion of each region, (R, 3, 3) and (R, 3), and coordinates with it, random elsewhere."""
-    count = len(body.regions)
+    count = len(body.regions.parts)
     matrix, shift = rng.normal(size=(count, 3, 3)), rng.normal(size=(count, 3))
     q = rng.normal(size=(body.function_count, 3))
-    q[: body.driven_count] = body.driven_affine(matrix, shift)
+    q[: body.driven_count] = body.regions.driven_affine(matrix, shift)
     return matrix, shift, q
 
 
 def test_bodies_of_files_before_keep_their_functions() -> None:
     """A body of version 3, whose envelope was as wide as the body, has the functions that it was built with."""
     body, beside = ReducedBody.load_with(Path(__file__).with_name("held_version_3.npz"))
-    assert body.envelope_length == 0.0 and not body.gap_blends
+    assert body.regions.envelope_length == 0.0 and not body.regions.gap_blends
     value, gradient = body.evaluate(beside["check.points"])
     np.testing.assert_allclose(value, beside["check.values"], atol=1e-12 * np.abs(value).max())
     np.testing.assert_allclose(gradient, beside["check.gradients"], atol=1e-6 * np.abs(gradient).max())
@@ -140,9 +140,9 @@ def test_envelope_vanishes_on_regions_and_blends_are_a_partition(wide: bool, gap
 def test_identities_hold_with_regions(body: ReducedBody, quadrature: Quadrature) -> None:
     """(1/V) sum V_p b_k b_l = delta_kl, the mean, linear reproduction, on the quadrature refined at the faces."""
     body.check()
-    moved = [region.moved(-body.offset, quadrature.bounds) for region in body.regions]
+    moved = [region.moved(-body.offset, quadrature.bounds) for region in body.regions.parts]
     pieces = pieces_near(quadrature, moved)
-    x, volume, parent = refine_at_faces(body.regions, pieces, body.offset)
+    x, volume, parent = refine_at_faces(body.regions.parts, pieces, body.offset)
     assert volume.sum() == pytest.approx(quadrature.volume, rel=1e-12)
     moment = np.stack([np.bincount(parent, volume * axis) for axis in x.T], axis=1)
     expected = pieces.weights[:, None] * (pieces.points - body.offset)
@@ -159,7 +159,7 @@ def test_affine_motion_is_exact_everywhere(body: ReducedBody, quadrature: Quadra
     """X goes to A X + t and F = A inside, on the surface and beyond the kernels' reach, however the basis is turned."""
     rng = np.random.default_rng(2)
     matrix, shift = rng.normal(size=(3, 3)), rng.normal(size=3)
-    x = np.concatenate([quadrature.points - body.offset, body.surface_points, 10.0 * body.surface_points])
+    x = np.concatenate([quadrature.points - body.offset, body.surface.points, 10.0 * body.surface.points])
     value, gradient = body.evaluate(x)
     q = body.affine(matrix, shift)
     # terms that cancel are 5 inside and up to 215 at ten times the size
@@ -173,17 +173,17 @@ def test_affine_motion_is_exact_everywhere(body: ReducedBody, quadrature: Quadra
     bound = 50.0 if body.provenance["option_mode_count"] else 150.0  # 108 of the body with exact and soft regions
     affine = np.linalg.pinv(body.linear_coordinates)
     rest = value - np.column_stack([x, np.ones(len(x))]) @ affine
-    count = len(body.surface_points)
+    count = len(body.surface.points)
     assert np.abs(rest[-count:]).max() < bound * np.abs(rest[-2 * count : -count]).max()
-    further, _ = body.evaluate(100.0 * body.surface_points)
+    further, _ = body.evaluate(100.0 * body.surface.points)
     further = further - np.column_stack([10.0 * x[-count:], np.ones(count)]) @ affine
     assert np.abs(further).max() < bound * np.abs(rest[-2 * count : -count]).max()
 
 
 def test_gradients_match_finite_differences(body: ReducedBody) -> None:
     """Grad b_k by central differences, away from the faces."""
-    apart = [np.abs(region.distance(body.points)[0]) > 1e-4 for region in body.regions]
-    points = body.points[np.all(apart, axis=0)]
+    apart = [np.abs(region.distance(body.cubature.points)[0]) > 1e-4 for region in body.regions.parts]
+    points = body.cubature.points[np.all(apart, axis=0)]
     _, gradient = body.evaluate(points)
     step = 1e-6 * body.length
     for d in range(3):
@@ -196,11 +196,11 @@ def test_regions_are_exact_beyond_the_kernels_reach(body: ReducedBody) -> None:
     """Points of a region that no kernel reaches, of 200 seeds: others vanish, the region moves as it is told."""
     rng = np.random.default_rng(6)
     matrix, shift, q = affine_motion(body, rng)
-    for i, region in enumerate(body.regions):
+    for i, region in enumerate(body.regions.parts):
         if region.stiffness is None:
             every = np.concatenate([inner_points(region, np.random.default_rng(seed)) for seed in range(200)])
             x = every[~body.covers(every)]
-            assert len(x) or len(body.regions) > 1
+            assert len(x) or len(body.regions.parts) > 1
             value, gradient = body.evaluate(x)
             assert np.abs(value[:, body.driven_count :]).max(initial=0.0) < 1e-12
             terms = np.abs(value) @ np.abs(q)
@@ -212,7 +212,7 @@ def test_regions_are_exact_beyond_the_kernels_reach(body: ReducedBody) -> None:
 
 def test_only_driven_functions_live_on_exact_regions(body: ReducedBody) -> None:
     """Functions from r on are zero all over every exact region, sampled or not; r = 4 per region."""
-    exact = [region for region in body.regions if region.stiffness is None]
+    exact = [region for region in body.regions.parts if region.stiffness is None]
     assert body.driven_count == 4 * len(exact)
     rng = np.random.default_rng(3)
     for region in exact:
@@ -225,18 +225,20 @@ def test_regions_follow_affine_motions_exactly(body: ReducedBody) -> None:
     """With q[:r] = driven_affine(A, t) every exact region moves to A_i X + t_i, whatever the free coordinates are."""
     rng = np.random.default_rng(4)
     matrix, shift, q = affine_motion(body, rng)
-    for i, region in enumerate(body.regions):
+    for i, region in enumerate(body.regions.parts):
         if region.stiffness is None:
             x = inner_points(region, rng)
             assert np.abs(x + body.evaluate(x)[0] @ q - (x @ matrix[i].T + shift[i])).max() < 1e-9
-    target = np.zeros_like(body.region_points)
-    for i in range(len(body.regions)):
-        rows = body.region_rows(body.region_names[i])
-        target[rows] = body.region_points[rows] @ (matrix[i] - np.eye(3)).T + shift[i]
-    np.testing.assert_allclose(body.driven_coordinates(target), q[: body.driven_count], atol=1e-10)
+    target = np.zeros_like(body.regions.points)
+    for i in range(len(body.regions.parts)):
+        rows = body.regions.rows(body.regions.names[i])
+        target[rows] = body.regions.points[rows] @ (matrix[i] - np.eye(3)).T + shift[i]
+    np.testing.assert_allclose(body.regions.driven_coordinates(target), q[: body.driven_count], atol=1e-10)
     # A motion of the whole body moves its regions alike.
     one = body.affine(matrix[0], shift[0])[: body.driven_count]
-    exact = body.driven_affine(np.tile(matrix[0], (len(body.regions), 1, 1)), np.tile(shift[0], (len(body.regions), 1)))
+    exact = body.regions.driven_affine(
+        np.tile(matrix[0], (len(body.regions.parts), 1, 1)), np.tile(shift[0], (len(body.regions.parts), 1))
+    )
     np.testing.assert_allclose(one, exact, atol=1e-10)
 
 
@@ -258,7 +260,7 @@ def test_regions_resist_each_other_as_finite_elements_say(gap: float, expected: 
     n, r = body.function_count, body.driven_count
     driven = np.zeros((2, 3, n))
     for axis, motion in zip((0, 2), driven, strict=True):
-        motion[:, :r] = body.driven_affine(np.stack([np.eye(3)] * 2), np.stack([np.zeros(3), np.eye(3)[axis]])).T
+        motion[:, :r] = body.regions.driven_affine(np.stack([np.eye(3)] * 2), np.stack([np.zeros(3), np.eye(3)[axis]])).T
     K, motions = stiffness(body, 0.3), driven.reshape(2, -1)
     free = np.tile(np.arange(n) >= r, 3)
     answer = -np.linalg.solve(K[np.ix_(free, free)], K[free] @ motions.T)
@@ -269,10 +271,10 @@ def test_regions_resist_each_other_as_finite_elements_say(gap: float, expected: 
 def test_drive_is_least_squares(body: ReducedBody) -> None:
     """For displacements that no affine motion gives, the residual is orthogonal to the driven functions."""
     rng = np.random.default_rng(5)
-    u = rng.normal(size=body.region_points.shape)
+    u = rng.normal(size=body.regions.points.shape)
     rows = exact_rows(body)
-    basis = body.evaluate(body.region_points[rows])[0][:, : body.driven_count]
-    residual = u[rows] - basis @ body.driven_coordinates(u)
+    basis = body.evaluate(body.regions.points[rows])[0][:, : body.driven_count]
+    residual = u[rows] - basis @ body.regions.driven_coordinates(u)
     assert np.abs(basis.T @ residual).max(initial=0.0) < 1e-9
 
 
@@ -292,7 +294,7 @@ def test_files_round_trip(body: ReducedBody, tmp_path: Path) -> None:
     body.save(file)
     loaded = ReducedBody.load(file)
     assert_same(body, loaded)
-    np.testing.assert_array_equal(body.evaluate(body.points)[0], loaded.evaluate(body.points)[0])
+    np.testing.assert_array_equal(body.evaluate(body.cubature.points)[0], loaded.evaluate(body.cubature.points)[0])
 
 
 def test_check_refuses_inconsistent_region_fields() -> None:
@@ -300,18 +302,18 @@ def test_check_refuses_inconsistent_region_fields() -> None:
     body = held("mixed", "freeform")
     bad = {
         "driven_count": 5,
-        "region_index": body.region_index + 1,
-        "core_index": np.zeros_like(body.core_index),
-        "handle_degrees": body.handle_degrees + 1,
-        "handle_regions": body.handle_regions + 3,
-        "region_weights": body.region_weights[1:],
-        "drive": body.drive.astype(np.float32),
+        "region_index": body.regions.index + 1,
+        "core_index": np.zeros_like(body.flat()["core_index"]),
+        "handle_degrees": body.handles.degrees + 1,
+        "handle_regions": body.handles.blends + 3,
+        "region_weights": body.regions.weights[1:],
+        "drive": body.regions.drive.astype(np.float32),
         "region_names": ("one",),
-        "region_radii": body.region_radii * np.nan,
+        "region_radii": body.flat()["region_radii"] * np.nan,
     }
     for name, value in bad.items():
         with pytest.raises(BasisError):
-            dataclasses.replace(body, **{name: value}).check()
+            changed(body, **{name: value})
 
 
 def test_bad_regions_are_refused(quadrature: Quadrature) -> None:
@@ -348,11 +350,11 @@ def test_bad_regions_are_refused(quadrature: Quadrature) -> None:
         build_body(quadrature, OPTIONS, regions=(everything,))
     body = held("mixed", "freeform")
     with pytest.raises(ConfigError, match="left"):
-        body.region_rows("right")
+        body.regions.rows("right")
     with pytest.raises(ConfigError, match="displacements"):
-        body.driven_coordinates(np.zeros((2, 3)))
+        body.regions.driven_coordinates(np.zeros((2, 3)))
     with pytest.raises(ConfigError, match="matrices"):
-        body.driven_affine(np.eye(3), np.zeros(3))
+        body.regions.driven_affine(np.eye(3), np.zeros(3))
 
 
 def test_capsule_with_a_layer_of_cells_as_region() -> None:
@@ -368,12 +370,12 @@ def test_soft_regions_can_move_apart(quadrature: Quadrature) -> None:
     """Two stiff springs' regions have a weight each: their affine motions are independent up to springs' give."""
     both = (dataclasses.replace(LEFT, stiffness=1e6), dataclasses.replace(RIGHT, stiffness=1e6))
     body = build_body(quadrature, OPTIONS, regions=both)
-    assert body.driven_count == 0 and not body.drive.size
-    basis, _ = body.evaluate(body.region_points)
-    target = np.zeros_like(body.region_points)
-    rows = body.region_rows("right")
-    target[rows] = np.cross([1.0, 0.0, 0.0], body.region_points[rows])
-    root = np.sqrt(body.region_weights)[:, None]
+    assert body.driven_count == 0 and not body.regions.drive.size
+    basis, _ = body.evaluate(body.regions.points)
+    target = np.zeros_like(body.regions.points)
+    rows = body.regions.rows("right")
+    target[rows] = np.cross([1.0, 0.0, 0.0], body.regions.points[rows])
+    root = np.sqrt(body.regions.weights)[:, None]
     q = np.linalg.lstsq(root * basis, root * target, rcond=1e-10)[0]
     assert np.linalg.norm(root * (basis @ q - target)) < 0.05 * np.linalg.norm(root * target)
 
@@ -382,10 +384,10 @@ def test_springs_of_a_soft_region_are_relative_to_what_they_hold(quadrature: Qua
     """Kappa = stiffness E with the local E: four times E everywhere changes no function, in one part its springs."""
     plain, regions = held("mixed", "freeform"), CASES["mixed"]
     stiff = build_body(quadrature, OPTIONS, regions=regions, stiffness_scale=np.full(len(quadrature.points), 4.0))
-    at = plain.points[::5]
+    at = plain.cubature.points[::5]
     size = np.abs(plain.evaluate(at)[0]).max()
     np.testing.assert_allclose(stiff.evaluate(at)[0], plain.evaluate(at)[0], atol=1e-8 * size)
     part = build_body(quadrature, OPTIONS, regions=regions, stiffness_scale=lambda x: np.where(x[:, 0] > 0.0, 4.0, 1.0))
-    foot = plain.region_rows("foot")
+    foot = plain.regions.rows("foot")
     for body in (stiff, part):
-        np.testing.assert_allclose(body.region_weights[foot], 4.0 * plain.region_weights[foot], rtol=1e-12)
+        np.testing.assert_allclose(body.regions.weights[foot], 4.0 * plain.regions.weights[foot], rtol=1e-12)

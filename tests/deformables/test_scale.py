@@ -24,7 +24,7 @@ from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from softmode.deformables.tools.markers import Markers
 from softmode.deformables.tools.sensing import ContactSensor, SurfacePressure
 from softmode.errors import ConfigError
-from tests.bodies import clamped, cube, ring
+from tests.bodies import changed, clamped, cube, ring
 from tests.deformables.affine_body import affine_cube, mean_gradient
 from tests.deformables.test_adjoint import EXACT
 from tests.scenes import GRAVITY, GRIPPER, Scene, add_gripper, rotation
@@ -55,11 +55,11 @@ def enlarged(body, s):
     }  # fmt: skip
     changes = {}
     for name, power in powers.items():
-        value = getattr(body, name)
+        value = body.flat()[name]
         changes[name] = value * s**power if np.isscalar(value) else (value * s**power).astype(value.dtype)
     factors = np.array([s, s, s, 1.0])
-    changes |= {name: getattr(body, name) * factors for name in ("linear_coordinates", "drive_affine")}
-    return dataclasses.replace(body, **changes, fingerprint=f"{body.fingerprint}, {s} times as large")
+    changes |= {name: body.flat()[name] * factors for name in ("linear_coordinates", "drive_affine")}
+    return changed(body, **changes, fingerprint=f"{body.fingerprint}, {s} times as large")
 
 
 ROUNDING = 8 * FLOAT32
@@ -108,10 +108,8 @@ def test_build_at_twice_the_size():
         "grad_basis",
         "weights",
     ):
-        value = getattr(twin, name)
-        np.testing.assert_allclose(
-            getattr(built, name), value, rtol=1e-6, atol=1e-6 * np.abs(value).max(), err_msg=name
-        )
+        value = twin.flat()[name]
+        np.testing.assert_allclose(built.flat()[name], value, rtol=1e-6, atol=1e-6 * np.abs(value).max(), err_msg=name)
 
 
 # -- identities --------------------------------------------------------------------------------------------------------
@@ -123,10 +121,10 @@ def test_rest_is_rest(s):
     R, p = rotation((1, 2, 3), 0.7), np.array([0.3, -0.2, 1.1])
     scene = Scene(lambda world: add_reduced_body(world, cube(), rotation=R, position=p, scale=s), [cube()])
     s = stored(s)
-    np.testing.assert_allclose(particles(scene), s * cube().surface_points @ R.T + p, atol=4 * FLOAT32)
+    np.testing.assert_allclose(particles(scene), s * cube().surface.points @ R.T + p, atol=4 * FLOAT32)
     start = scene.q()
     scene.step(5)
-    np.testing.assert_allclose(particles(scene), s * cube().surface_points @ R.T + p, atol=ROUNDING * s * EDGE + 2e-7)
+    np.testing.assert_allclose(particles(scene), s * cube().surface.points @ R.T + p, atol=ROUNDING * s * EDGE + 2e-7)
     assert np.linalg.norm(scene.q() - start) < ROUNDING * s * EDGE
 
 
@@ -220,7 +218,7 @@ def test_recovery_from_a_point(s):
     scene.set(q=cube().affine(0.01 * np.eye(3)))
     scene.step(150)
     np.testing.assert_allclose(scene.reduced.view.points.volume_ratio.numpy(), 1.0, atol=1e-3)
-    x, X = particles(scene), stored(s) * cube().surface_points
+    x, X = particles(scene), stored(s) * cube().surface.points
     far = np.linalg.norm(x[:, None] - x, axis=2).max()
     assert far == pytest.approx(np.linalg.norm(X[:, None] - X, axis=2).max(), rel=1e-3)
 
@@ -380,8 +378,8 @@ def test_driven_region():
         scene.step(10)
     x, twin = (particles(scene) for scene in scenes)
     np.testing.assert_allclose(x, twin, atol=ROUNDING * s * 0.2)
-    held = clamped().surface_points[:, 0] < -0.08
-    np.testing.assert_allclose(x[held], stored(s) * clamped().surface_points[held] @ A.T + t, atol=1e-6)
+    held = clamped().surface.points[:, 0] < -0.08
+    np.testing.assert_allclose(x[held], stored(s) * clamped().surface.points[held] @ A.T + t, atol=1e-6)
 
 
 def test_gradients():
@@ -390,7 +388,7 @@ def test_gradients():
 
     def populate(world, body, scale):
         index = add_reduced_body(world, body, material=SOFT, velocity=(0.3, -0.2, 0.5), scale=scale)
-        points = s * cube().points[cube().points[:, 2] > 0.03]
+        points = s * cube().cubature.points[cube().cubature.points[:, 2] > 0.03]
         add_pins(world, index, points, stiffness=20.0)
 
     steps, weight = 5, np.random.default_rng(0).normal(size=(6, cube().function_count, 3))
@@ -441,7 +439,7 @@ def test_uniaxial_stretch(s):
     )
     pull = strain * modulus * (stored(s) * 0.1) ** 2
     # forces on the samples with the sum and the moments of the pull at both faces: that of z is pull * edge, no other
-    x = np.column_stack([body.surface_points, np.ones(body.surface_count)])
+    x = np.column_stack([body.surface.points, np.ones(body.surface_count)])
     share = x @ np.linalg.solve(x.T @ x, [0.0, 0.0, pull * 0.1, 0.0])
     force = np.column_stack([np.zeros((len(x), 2)), share]).astype(np.float32)
     for _ in range(80):

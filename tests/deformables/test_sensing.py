@@ -65,7 +65,7 @@ def test_weight_through_the_pressure():
     np.testing.assert_allclose(sensor.total_position.numpy()[0, :2], 0.0, atol=1e-3 * EDGE)
     pressed = sensor.pressure.numpy()[0] > 0.0
     assert sensor.total_area.numpy()[0] == pytest.approx(sensor.area[pressed].sum(), rel=1e-6)
-    bottom = scene.body().surface_points[:, 2] < -0.499 * EDGE
+    bottom = scene.body().surface.points[:, 2] < -0.499 * EDGE
     np.testing.assert_array_equal(pressed, bottom)
     np.testing.assert_allclose(ground.total_force.numpy()[0, 0], -force, atol=4 * FLOAT32 * weight)
     assert ground.total_area.numpy()[0, 0] == sensor.total_area.numpy()[0]
@@ -173,7 +173,7 @@ def test_soft_on_soft():
     spacing.
     """
     body = cube()
-    lever = 0.02 * np.sqrt(body.surface_areas.mean())
+    lever = 0.02 * np.sqrt(body.surface.areas.mean())
 
     def populate(world):
         for k in range(2):
@@ -191,7 +191,7 @@ def test_soft_on_soft():
         np.testing.assert_allclose(integral(sensor), total, atol=64 * FLOAT32 * weight)
         np.testing.assert_allclose(sensor.total_torque.numpy()[0], 0.0, atol=lever * weight)
     for sensor, side in zip(sensors, (1.0, -1.0), strict=True):
-        touched = side * body.surface_points[:, 2] > 0.499 * EDGE
+        touched = side * body.surface.points[:, 2] > 0.499 * EDGE
         p, n = sensor.pressure.numpy()[0], sensor.normal.numpy()[0]
         force = (sensor.area * p * n[:, 2])[touched].sum()
         assert force == pytest.approx(-side * weight, rel=1e-2)

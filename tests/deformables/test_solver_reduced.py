@@ -81,7 +81,7 @@ def test_affine_closure():
         A, t = np.eye(3) + 0.5 * rng.normal(size=(3, 3)), rng.normal(size=3)
         q = body.affine(A, t)
         scene.set(q=q)
-        expected = body.surface_points @ A.T + t
+        expected = body.surface.points @ A.T + t
         # Basis values and positions are float32.
         np.testing.assert_allclose(scene.state.particle_q.numpy(), expected, atol=8 * FLOAT32 * (1.0 + np.abs(t).max()))
         np.testing.assert_allclose(twin.deformation_gradient(q), np.broadcast_to(A, (128, 3, 3)), atol=1e-5)
@@ -501,7 +501,7 @@ def test_masked_reset():
         np.testing.assert_array_equal(scene.qd(i), qd)
     after = scene.state.particle_q.numpy().reshape(3, -1, 3)
     np.testing.assert_array_equal(after[[0, 2]], particles[[0, 2]])
-    np.testing.assert_allclose(after[1], cube().surface_points, atol=4 * FLOAT32 * SIZE)
+    np.testing.assert_allclose(after[1], cube().surface.points, atol=4 * FLOAT32 * SIZE)
 
 
 def test_parameters_change_at_run_time():
@@ -585,7 +585,7 @@ def test_set_velocity_turns_a_deformed_body_about_its_centre():
     energy = 0.5 * (scene.mass() * v @ v + omega @ spin)
     np.testing.assert_allclose(scene.kinetic_energy(), energy, rtol=1e-12)
     np.testing.assert_array_equal(scene.qd(1), other)
-    moved = cube().surface_basis @ scene.qd(0)
+    moved = cube().surface.basis @ scene.qd(0)
     found = scene.state.particle_qd.numpy()[: cube().surface_count]
     np.testing.assert_allclose(found, moved, atol=4 * FLOAT32 * np.abs(moved).max())
     squeezed = lambda X: -0.1 * X  # noqa: E731

@@ -168,8 +168,8 @@ def test_responses_carry_a_clamped_beam(quadrature: Quadrature) -> None:
     for responses in (True, False):
         body = build_body(quadrature, dataclasses.replace(options, static_responses=responses), regions=(LEFT,))
         r = body.driven_count
-        grad = body.grad_basis[:, r:].astype(float)
-        found[responses] = compliance(grad, body.weights, body.volume * body.mean_basis[r:])
+        grad = body.cubature.grad_basis[:, r:].astype(float)
+        found[responses] = compliance(grad, body.cubature.weights, body.volume * body.mean_basis[r:])
     shape, weights, _ = held(quadrature, LEFT)
     free = np.flatnonzero(np.asarray(shape.value.multiply(shape.value).sum(axis=0)).ravel() > 1e-12)
     grad = np.stack([g.toarray()[:, free] for g in shape.gradient], axis=2)

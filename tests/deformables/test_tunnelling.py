@@ -285,12 +285,12 @@ def test_far_shape_is_culled(name):
 def test_inner_offsets_end_inside():
     """The ways inward end in the cube, a tenth of its diagonal deep, and at edges go in between their faces."""
     body = cube()
-    offsets = inner_offsets(body.surface_points, body.surface_normals, EDGE * np.sqrt(3.0))
+    offsets = inner_offsets(body.surface.points, body.surface.normals, EDGE * np.sqrt(3.0))
     length = np.linalg.norm(offsets, axis=1)
     assert (length > 0.0).all() and np.median(length) == pytest.approx(0.1 * EDGE * np.sqrt(3.0))
-    inside = reference.distance_box(body.surface_points + offsets, np.full(3, 0.5 * EDGE))
+    inside = reference.distance_box(body.surface.points + offsets, np.full(3, 0.5 * EDGE))
     assert (inside < 0.0).all() and (inside < -0.3 * length).mean() > 0.95
-    assert ((offsets * body.surface_normals).sum(axis=1) < -0.5 * length).all()
+    assert ((offsets * body.surface.normals).sum(axis=1) < -0.5 * length).all()
 
 
 def test_inner_offsets_of_a_sheet_stay_inside():

@@ -29,7 +29,7 @@ from softmode.deformables.reduction.sources import unpack_sources
 from softmode.errors import AssetError, BasisError
 from softmode.files import write_archive
 from softmode.objects.shapes.primitives import scaled, turned
-from tests.bodies import brick
+from tests.bodies import brick, changed
 from tests.marks import rest_but
 from tests.shapes import voxels
 
@@ -260,14 +260,14 @@ def slit() -> ReducedBody:
 
 def test_a_slit_beside_a_corner(slit: ReducedBody) -> None:
     """Kernels go around the corner and act on one lip alone, functions reproduce linear ones, gradients agree."""
-    assert len(slit.detour_pairs) > 1000 and len(slit.hidden_pairs) > 1000
+    assert len(slit.flat()["detour_pairs"]) > 1000 and len(slit.flat()["hidden_pairs"]) > 1000
     lips = np.array([[0.078, 0.01, EDGE + side * 0.003] for side in (-1.0, 1.0)]) - slit.offset
-    value = slit.kernels.evaluate(lips).value.toarray()
+    value = slit.reproducing_kernels.evaluate(lips).value.toarray()
     assert (value != 0.0).sum(axis=1).min() >= 4 and not (value[0] * value[1]).any()
     cells = unpack_sources(slit).quadrature.cells
     assert cells is not None
-    x, h = cells.octants - slit.offset, float(slit.kernels.support.mean())
-    found = slit.kernels.evaluate(x)
+    x, h = cells.octants - slit.offset, float(slit.reproducing_kernels.support.mean())
+    found = slit.reproducing_kernels.evaluate(x)
     assert np.abs(found.value @ slit.kernels.centres - x).max() < 1e-12
     for d, gradient in enumerate(found.gradient):
         assert np.abs(gradient @ slit.kernels.centres - np.eye(3)[d]).max() < 1e-9 / h
@@ -276,7 +276,7 @@ def test_a_slit_beside_a_corner(slit: ReducedBody) -> None:
 def test_file_round_trip(body: ReducedBody, slit: ReducedBody, tmp_path: Path) -> None:
     """Bodies with corners and slits come back with the same values anywhere; others store nothing of them."""
     path = tmp_path / "body.npz"
-    assert len(body.detour_pairs) > 1000 and not len(body.hidden_pairs)
+    assert len(body.flat()["detour_pairs"]) > 1000 and not len(body.flat()["hidden_pairs"])
     for one in (body, slit):
         one.save(path)
         loaded = ReducedBody.load(path)
@@ -287,18 +287,21 @@ def test_file_round_trip(body: ReducedBody, slit: ReducedBody, tmp_path: Path) -
         assert not {"material_points", "material_frame", "hidden_pairs", "detour_pairs", "detour_lengths"} & set(
             file.files
         )
-    assert ReducedBody.load(path).kernels.visibility is None and ReducedBody.load(path).kernels.detours is None
+    assert (
+        ReducedBody.load(path).reproducing_kernels.visibility is None
+        and ReducedBody.load(path).reproducing_kernels.detours is None
+    )
 
 
 def test_files_of_version_2_are_read(slit: ReducedBody, tmp_path: Path) -> None:
     """What an earlier version wrote, with hidden pairs and without, has the functions that it had."""
     path = tmp_path / "old.npz"
     none = np.zeros(0, dtype=np.int64)
-    for hidden in (slit.hidden_pairs, none):
-        old = dataclasses.replace(
+    for hidden in (slit.flat()["hidden_pairs"], none):
+        old = changed(
             slit,
             hidden_pairs=hidden,
-            material_points=slit.material_points[: len(hidden) and None],
+            material_points=slit.flat()["material_points"][: len(hidden) and None],
             material_frame=np.eye(3),
             detour_pairs=none,
             detour_lengths=np.zeros(0, dtype=np.float32),
@@ -307,7 +310,7 @@ def test_files_of_version_2_are_read(slit: ReducedBody, tmp_path: Path) -> None:
         assert ("hidden_pairs" in arrays) == (len(hidden) > 0) and "detour_pairs" not in arrays
         write_archive(path, header | {"version": 2}, arrays)
         loaded = ReducedBody.load(path)
-        np.testing.assert_array_equal(loaded.evaluate(old.points)[0], old.evaluate(old.points)[0])
+        np.testing.assert_array_equal(loaded.evaluate(old.cubature.points)[0], old.evaluate(old.cubature.points)[0])
     write_archive(path, header | {"version": 1}, arrays)
     with pytest.raises(AssetError, match="version 1, this softmode reads 2"):
         ReducedBody.load(path)
@@ -325,7 +328,7 @@ def test_damaged_tables_are_refused(slit: ReducedBody, tmp_path: Path, change: s
     if change == "order":
         pairs[[0, 1]] = pairs[[1, 0]]
     elif change == "range":
-        pairs[-1] = len(points) * len(slit.centres)
+        pairs[-1] = len(points) * len(slit.kernels.centres)
     elif change == "negative":
         pairs[0] = -1
     elif change == "sign":

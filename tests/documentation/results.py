@@ -37,8 +37,8 @@ def _bodies(names: dict[str, Any], folder: Path) -> None:
     """No parameter was clamped, no step of the last scene went wrong, and its grip is on its way up."""
     assert names["flags"].numpy().tolist() == [0] * 16
     assert names["solver"].status.numpy().tolist() == [0]
-    gripped = names["state"].particle_q.numpy()[names["body"].surface_points[:, 2] > 0.045][:16]
-    rest = names["body"].surface_points[names["body"].surface_points[:, 2] > 0.045][:16]
+    gripped = names["state"].particle_q.numpy()[names["body"].surface.points[:, 2] > 0.045][:16]
+    rest = names["body"].surface.points[names["body"].surface.points[:, 2] > 0.045][:16]
     assert 1.0 < gripped[:, 2].mean() - rest[:, 2].mean() < 1.021
 
 

@@ -97,7 +97,7 @@ def _gradients(folder: Path) -> dict[str, Any]:
     body = bar()
     world = newton.ModelBuilder()
     add_reduced_body(world, body, position=(0.0, 0.0, 1.0))
-    observed = body.surface_points[:20] + np.array([0.0, 0.0, 1.0])
+    observed = body.surface.points[:20] + np.array([0.0, 0.0, 1.0])
     return {"body": body, "model": world.finalize(), "dt": 1.0 / 240.0, "observed": observed}
 
 

@@ -74,7 +74,7 @@ def test_what_a_film_shows(lift: Any) -> None:
                 continue
             if not free:
                 q = scene.state.softmode.q.numpy()[: body.function_count]
-                F = np.eye(3) + np.einsum("kd,pke->pde", q, body.grad_basis)
+                F = np.eye(3) + np.einsum("kd,pke->pde", q, body.cubature.grad_basis)
                 strain = np.abs(np.linalg.svd(F, compute_uv=False) - 1.0).max()
             whole, seen = masks(film)
             free.append((whole & seen).sum() / whole.sum())

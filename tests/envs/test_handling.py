@@ -32,7 +32,7 @@ def strain_of(F: np.ndarray) -> np.ndarray:
 def body_strain(env: LiftSoftEnv) -> float:
     """Return the largest principal strain of the object now."""
     body, q = env.scene.soft.body, env.scene.state.softmode.q.numpy()
-    F = np.eye(3) + np.einsum("ka,pkb->pab", q[: body.function_count], body.grad_basis)
+    F = np.eye(3) + np.einsum("ka,pkb->pab", q[: body.function_count], body.cubature.grad_basis)
     return float(strain_of(F).max())
 
 

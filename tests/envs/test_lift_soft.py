@@ -152,7 +152,7 @@ def test_reset_options_place_the_object(lift: LiftSoftEnv) -> None:
     assert info["parameters"]["youngs_modulus"] == 1.0e5
     np.testing.assert_allclose(lift.scene.object_position.numpy()[0, 0, :2], given["position"], atol=1e-6)
     turn = np.array([[np.cos(0.5), -np.sin(0.5), 0.0], [np.sin(0.5), np.cos(0.5), 0.0], [0.0, 0.0, 1.0]])
-    rest = lift.scene.soft.body.surface_points
+    rest = lift.scene.soft.body.surface.points
     placed = lift.scene.state.particle_q.numpy()[: len(rest)]
     np.testing.assert_allclose(placed - placed[0], (rest - rest[0]) @ turn.T, atol=1e-5)
     again, _ = lift.reset(options={**given, "position": np.array(given["position"]), "yaw": np.array(0.5)})

@@ -57,7 +57,7 @@ class HostState:
         self.q = q[spans[0]]
         self.centres = np.array([body.mean_basis @ q[span] for body, span in zip(bodies, spans, strict=True)])
         self.velocity = bodies[0].mean_basis @ qd[spans[0]]
-        self.rest = bodies[0].surface_points[env.task.points]
+        self.rest = bodies[0].surface.points[env.task.points]
         dents = self.dents()[env.task.points]
         self.dented = float(np.abs(dents).max())
         self.points = self.deformed(self.rest) + dents
@@ -81,7 +81,7 @@ class HostState:
         body, view, data = self.scene.soft.body, self.scene.solver.view, self.scene.model.softmode
         young, ratio, scale = (float(getattr(data, name).numpy()[0]) for name in MATERIAL)
         size = (body.volume / (body.function_count - body.driven_count)) ** (1.0 / 3.0)
-        free = np.abs(body.surface_basis[:, body.driven_count :]).max(axis=1) > 1.0e-6  # the clamped foot has none
+        free = np.abs(body.surface.basis[:, body.driven_count :]).max(axis=1) > 1.0e-6  # the clamped foot has none
         w = 0.39 * scale * np.minimum(size, 0.6 * thickness(body)) * (1.0 - ratio**2) / young * free
         c = view.constraints
         assert not c.pair_count.numpy()[0]
@@ -89,7 +89,7 @@ class HostState:
         sample = c.partner_row.numpy()[0, held] - int(view.instances.row_start.numpy()[0])
         normal, moved = c.normal.numpy()[0, held], c.offset.numpy()[0, held] + c.displacement.numpy()[0, held]
         give = c.dent_compliance.numpy()[0, held]
-        assert (give <= (1.0 + 1.0e-5) * w[sample] / (scale**2 * body.surface_areas[sample])).all()
+        assert (give <= (1.0 + 1.0e-5) * w[sample] / (scale**2 * body.surface.areas[sample])).all()
         softer = c.stiffness.numpy()[0, held] * give
         penetration = -np.einsum("ek,ek->e", normal, moved)
         depth = softer / (1.0 + softer) * np.maximum(penetration - c.lead.numpy()[0, held], 0.0)
@@ -135,7 +135,7 @@ def push_soft(seen: HostState) -> Numbers:
     heading = np.sum(np.conj(wanted) * (found[:, 0] + 1j * found[:, 1]))
     heading /= np.abs(heading)
     way = goal - centre[:2]
-    surface = seen.scene.soft.body.surface_points
+    surface = seen.scene.soft.body.surface.points
     back = seen.drawn["scale"][0] * (np.hypot(*surface[:, :2].T).max() + 0.5 * seen.arm.gripper.pad_size[0])
     behind = centre[:2] - back * way / np.linalg.norm(way)
     height = seen.env.config.scene.control.workspace_lower[2] + 0.006

@@ -134,7 +134,7 @@ def test_objects_begin_apart_and_stay(kind: Any, config: Any) -> None:
         np.testing.assert_array_equal(others(env, "other_offsets").reshape(-1, 3), centres[1:] - centres[0])
         assert others(env, "other_present").tolist() == [1.0] * 7
         apart = np.linalg.norm(centres[:, None, :2] - centres[None, :, :2], axis=2) + np.eye(8)
-        width = max(np.linalg.norm(x.body.surface_points[:, :2], axis=1).max() for x in env.scene.occupancy.choices)
+        width = max(np.linalg.norm(x.body.surface.points[:, :2], axis=1).max() for x in env.scene.occupancy.choices)
         assert apart.min() > 2.0 * width + env.config.others_clearance - 1e-6
         modulus = env.scene.model.softmode.youngs_modulus.numpy()
         np.testing.assert_array_equal(modulus, [np.float32(MATERIALS[k].youngs_modulus) for k in info["object"]])

@@ -76,7 +76,7 @@ def test_goals_are_surface_points_seen_from_the_foot(shape: ShapeSoftEnv) -> Non
     observation, info = shape.reset(seed=0, options=given)
     samples = shape.scene.state.particle_q.numpy()[shape.task.points]
     np.testing.assert_allclose(points(observation["achieved_goal"]), samples - [0.455, -0.005, 0.0], atol=1e-6)
-    rest = turned(shape.scene.soft.body.surface_points[shape.task.points], 0.9)
+    rest = turned(shape.scene.soft.body.surface.points[shape.task.points], 0.9)
     rest[:, 2] += shape.scene.soft.height
     # between two of 24 directions a point of radius r is off its circle by r (1 - cos(pi / 24))
     np.testing.assert_allclose(points(observation["desired_goal"]), rest, atol=0.015 * (1 - np.cos(np.pi / 24)) + 3e-4)
@@ -97,7 +97,7 @@ def test_observation_does_not_depend_on_the_goal(shape: ShapeSoftEnv) -> None:
 def test_targets_turn_with_their_direction(shape: ShapeSoftEnv) -> None:
     """Turning post and direction together turns the target; its free end moves as far as was asked for."""
     body = shape.scene.soft.body
-    top = np.argmax(body.surface_points[shape.task.points, 2])
+    top = np.argmax(body.surface.points[shape.task.points, 2])
     for displacement in (0.03, 0.05):
         goals = []
         for angle in (0.0, 1.0):
@@ -238,7 +238,7 @@ def test_the_goal_is_another_body(square: ShapeSoftEnv) -> None:
 def test_the_foot_stays_where_it_is_clamped(shape: ShapeSoftEnv) -> None:
     """Bent by the arm, the post keeps its foot to the micrometre, at whatever place and yaw, and springs back."""
     info = play(shape, 3, position=(0.455, 0.005), yaw=1.0, youngs_modulus=1e5)
-    rest = shape.scene.soft.body.surface_points
+    rest = shape.scene.soft.body.surface.points
     foot = rest[:, 2] < rest[:, 2].min() + 0.011
     placed = turned(rest, 1.0) + np.array([0.455, 0.005, shape.scene.soft.height + GAP])
     now = shape.scene.state.particle_q.numpy()

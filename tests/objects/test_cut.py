@@ -81,7 +81,7 @@ def test_splats_go_to_their_side(box: SoftObject) -> None:
     z = splats.means[:, 2] + box.body.offset[2] - height
     straddling = (np.abs(z) < 2.0 * np.sqrt(splats.covariances()[:, 2, 2])).sum()
     assert straddling > 20 and sum(map(len, sides)) == splats.count + straddling + face
-    area = sum((abs(part.body.surface_points[:, 2] + part.body.offset[2] - height) < 1e-6).sum() for part in parts)
+    area = sum((abs(part.body.surface.points[:, 2] + part.body.offset[2] - height) < 1e-6).sum() for part in parts)
     assert face > area > 10
     inside = cut_object(box, Patch.plane((0.0, 0.0, height), (0.0, 0.0, 1.0)), inside=(1.0, 0.0, 0.0))[0][0]
     red = np.abs(inside.visible_splats.means[:, 2] + inside.body.offset[2] - height) < 1e-6

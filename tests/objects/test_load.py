@@ -6,7 +6,7 @@ Builds objects, which is what it tests.
 from __future__ import annotations
 
 import warnings
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import newton
@@ -24,6 +24,7 @@ from softmode.objects.pose import seat_of
 from softmode.scenes.table_scene import TableSceneConfig
 from softmode.splats import make_plush, write_ply
 from softmode.splats.formats import read_splats
+from tests.bodies import assert_same
 
 SMALL = {
     "size": 0.06,
@@ -69,7 +70,7 @@ def test_a_body_is_covered_and_keeps_its_material(cup: Path) -> None:
     thing = load(body, material=RUBBER, contact_radius=0.002)
     assert thing.body is body and thing.material == RUBBER
     np.testing.assert_array_equal(thing.visible_splats.means, surface_cover(body).means)
-    assert thing.height == pytest.approx(0.002 - body.surface_points[:, 2].min())
+    assert thing.height == pytest.approx(0.002 - body.surface.points[:, 2].min())
 
 
 def test_what_is_no_source_is_refused() -> None:
@@ -94,7 +95,7 @@ def test_a_placed_object_is_where_it_was_put(cup: Path) -> None:
     placed = Placed(object=thing, position=(0.1, 0.2, 0.3), rotation=turn, scale=2.0, velocity=(0.0, 0.0, -1.0))
     builder = newton.ModelBuilder()
     assert placed.add_to(builder) == 0 and placed.add_to(builder, self_contact=True) == 1
-    expected = 2.0 * thing.body.surface_points @ turn.T + placed.position
+    expected = 2.0 * thing.body.surface.points @ turn.T + placed.position
     model = builder.finalize(device="cpu")
     count = thing.body.surface_count
     particles, velocities, masses = model.particle_q, model.particle_qd, model.particle_mass
@@ -125,13 +126,13 @@ def test_a_body_is_built_for_the_ratio_of_its_material(cup: Path) -> None:
         load(cup, material=material, build=small, **options).body for material in (None, Material(), rubber)
     )
     assert default.fingerprint == plain.fingerprint
-    np.testing.assert_array_equal(default.grad_basis, plain.grad_basis)
+    np.testing.assert_array_equal(default.cubature.grad_basis, plain.cubature.grad_basis)
     assert found.provenance["option_poissons_ratio"] == 0.49 and found.serves_ratio(0.49)
     assert found.fingerprint != plain.fingerprint
     again = load(cup, material=rubber, build=small, **options)
     assert again.config is not None and again.config.build == small, "the configuration stays as it was given"
     anew, _ = build_object(cup, material=rubber, build=small, **options)
-    np.testing.assert_array_equal(anew.body.grad_basis, found.grad_basis)
+    np.testing.assert_array_equal(anew.body.cubature.grad_basis, found.cubature.grad_basis)
     assert anew.material == rubber
 
 
@@ -166,9 +167,7 @@ def test_load_and_build_object_make_one_body(tmp_path: Path) -> None:
     config = ObjectConfig(preset="banana", splat_count=400, clamped_height=0.01, **given)
     one = load(config)
     two, quadrature = build_object(config)
-    for field in fields(one.body):
-        if field.name not in ("provenance", "build_seconds", "sources"):
-            np.testing.assert_array_equal(getattr(one.body, field.name), getattr(two.body, field.name), field.name)
+    assert_same(one.body, two.body, skip=("provenance", "build_seconds", "sources"))
     told, again = (
         {name: value for name, value in thing.body.provenance.items() if not name.startswith("seconds_")}
         for thing in (one, two)
@@ -176,8 +175,8 @@ def test_load_and_build_object_make_one_body(tmp_path: Path) -> None:
     assert told == again and told["seat"] == str(seat_of(quadrature.bounds).tolist())
     np.testing.assert_array_equal(one.visible_splats.means, two.visible_splats.means)
     assert one.material == two.material == PRESETS["banana"].material and one.config == two.config == config
-    assert one.body.region_names == ("foot",) and one.body.driven_count > 0
-    assert set(one.body.stiffness_scale) == {1.0, 3.0}
+    assert one.body.regions.names == ("foot",) and one.body.driven_count > 0
+    assert set(one.body.cubature.stiffness_scale) == {1.0, 3.0}
     assert one.body.offset[0] - quadrature.weights @ quadrature.points[:, 0] / quadrature.volume > 0.01
 
 

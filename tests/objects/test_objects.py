@@ -99,7 +99,7 @@ def box(x: float, y: float, z: float) -> np.ndarray:
 def test_an_object_that_stands_is_left_alone() -> None:
     """A cube and the plush rest on a face already; a ball never tips, whatever it stands on."""
     assert stable_rotation(box(1.0, 1.0, 1.0)) is None
-    assert stable_rotation(load(ObjectConfig()).body.surface_points) is None
+    assert stable_rotation(load(ObjectConfig()).body.surface.points) is None
 
 
 @pytest.mark.parametrize("tilt", [0.3, 0.7, 1.2])
@@ -131,7 +131,7 @@ def test_plush_stands_on_the_table_at_its_size() -> None:
     """The longest edge is the size, the lowest surface sample lies `height` under the centre of mass."""
     thing = load(ObjectConfig(size=0.07))
     assert np.ptp(thing.visible_splats.means, axis=0).max() == pytest.approx(0.07, rel=0.02)
-    assert thing.height == pytest.approx(-thing.body.surface_points[:, 2].min())
+    assert thing.height == pytest.approx(-thing.body.surface.points[:, 2].min())
     assert thing.basis.shape == (thing.visible_splats.count, thing.body.function_count)
     assert thing.grad_basis.shape == (*thing.basis.shape, 3)
 
@@ -145,9 +145,9 @@ def test_a_contact_radius_lifts_what_stands_free() -> None:
     assert thing.body.driven_count == 0
     assert load(replace(box, contact_radius=0.002)).height == pytest.approx(thing.height + 0.002)
     post = load(replace(box, contact_radius=0.002, clamped_height=0.01))
-    assert post.height == pytest.approx(-post.body.surface_points[:, 2].min())
-    low = post.body.surface_points[:, 2] < post.body.surface_points[:, 2].min() + 0.009
-    free = post.body.evaluate(post.body.surface_points)[0][:, post.body.driven_count :]
+    assert post.height == pytest.approx(-post.body.surface.points[:, 2].min())
+    low = post.body.surface.points[:, 2] < post.body.surface.points[:, 2].min() + 0.009
+    free = post.body.evaluate(post.body.surface.points)[0][:, post.body.driven_count :]
     assert post.body.driven_count > 0 and low.sum() >= 4
     assert np.abs(free[low]).max() < 1e-6 < np.abs(free[~low]).max()
 
@@ -193,10 +193,10 @@ def test_trained_capture_becomes_the_robot(playbot: Path) -> None:
     thing = load(config)
     assert 1500 < thing.visible_splats.count < 1900  # of 8406: 6163 are ground, 468 are hands
     assert thing.visible_splats.sh_degree == 2
-    lying = stable_rotation(thing.body.surface_points)
+    lying = stable_rotation(thing.body.surface.points)
     assert lying is None
     standing = load(replace(config, pose="captured"))
-    assert stable_rotation(standing.body.surface_points) is not None
+    assert stable_rotation(standing.body.surface.points) is not None
     assert np.ptp(standing.visible_splats.means, axis=0).max() == pytest.approx(0.08, rel=0.03)
     assert thing.height < 0.6 * standing.height
     assert thing.body.volume == pytest.approx(standing.body.volume, rel=0.02)

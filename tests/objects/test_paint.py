@@ -43,8 +43,10 @@ def test_painted_late_is_painted_at_once() -> None:
 
     def lowest(body: ReducedBody) -> float:
         """Return the first elastic eigenvalue at rest."""
-        gradient = body.grad_basis.astype(np.float64).transpose(1, 2, 0)
-        return float(elastic_modes(reduced_stiffness(gradient, body.weights * body.stiffness_scale, 0.3))[0][0])
+        gradient = body.cubature.grad_basis.astype(np.float64).transpose(1, 2, 0)
+        return float(
+            elastic_modes(reduced_stiffness(gradient, body.cubature.weights * body.cubature.stiffness_scale, 0.3))[0][0]
+        )
 
     assert lowest(late) < 0.5 * lowest(free)
 
@@ -91,7 +93,7 @@ def test_an_object_by_its_colours() -> None:
     base = ObjectConfig(**shape, colors=(RED, BLUE))
     painted = {"stiffness_by_color": ("#cc1a1a:0.1",), "density_by_color": ("#cc1a1a:3",)}
     thing = load(ObjectOptions(**painted).object_of(base))
-    assert set(thing.body.stiffness_scale) == {0.1, 1.0}
+    assert set(thing.body.cubature.stiffness_scale) == {0.1, 1.0}
     given = unpack_sources(thing.body)
     scale, density = given.stiffness_scale, given.density_scale
     assert scale is not None and set(np.unique(scale)) == {0.1, 1.0}

@@ -53,7 +53,7 @@ def bent_solid(poissons_ratio: float) -> float:
 def bent_body(body: ReducedBody, poissons_ratio: float) -> float:
     """Return the energy of the bent body per E [m^3], over its own cubature."""
     mesh, n = BAR.mesh(), body.function_count
-    G, w = body.grad_basis.astype(np.float64), body.weights
+    G, w = body.cubature.grad_basis.astype(np.float64), body.cubature.weights
     law = Energy.make("stable_neo_hookean_log", np.ones(len(w)), poissons_ratio)
     places = [mesh.points[end].reshape(-1, 3) for end in ends(mesh)]
     roots = [np.sqrt(KAPPA * mesh.weights[end].reshape(-1, 1)) for end in ends(mesh)]

@@ -29,10 +29,10 @@ def test_fingertips_stand_out_of_the_pads():
     for samples, side, attachment in zip(x, (1.0, -1.0), tips.attachments, strict=True):
         y = side * samples[:, 1]
         # extreme samples lie within half a spacing of the apex, which is s^2 / (2 r) behind it there
-        flat = 0.5 * tips.body.surface_areas.max() / RADIUS
+        flat = 0.5 * tips.body.surface.areas.max() / RADIUS
         assert y.min() == pytest.approx(0.5 * opening - RADIUS, abs=flat)
         assert y.max() == pytest.approx(0.5 * opening + RADIUS, abs=flat)
-        middle = np.average(samples, axis=0, weights=tips.body.surface_areas)
+        middle = np.average(samples, axis=0, weights=tips.body.surface.areas)
         np.testing.assert_allclose(middle[[0, 2]], tool[[0, 2]], atol=0.05 * RADIUS)
         behind = (y >= 0.5 * opening).sum()
         assert attachment.count == behind

@@ -53,7 +53,7 @@ def test_kinetic_energy_of_free_fall_is_the_work_of_gravity(cube: SoftObject) ->
     for frame in (1, 2):
         scene.step()
         assert scene.kinetic_energy() == pytest.approx(MASS * (4 * frame * GRAVITY * DT) ** 2, rel=1e-5)
-    moved = (scene.surface(1) - cube.body.surface_points - (0.3, 0.0, 1.0)).mean(axis=0)
+    moved = (scene.surface(1) - cube.body.surface.points - (0.3, 0.0, 1.0)).mean(axis=0)
     np.testing.assert_allclose(moved, (0.0, 0.0, -GRAVITY * DT**2 * 8 * 9 / 2), atol=1e-6)
 
 
@@ -74,7 +74,7 @@ def test_what_starts_inside_is_said(cube: SoftObject, caplog: pytest.LogCaptureF
 def test_pushed_samples_carry_the_weight(cube: SoftObject) -> None:
     """Forces on the surface that sum to the weight keep a cube at rest where it hangs; without them it falls."""
     scene = make_scene(cube, (0.0, 0.0, 1.0), steps_per_frame=4)
-    share = cube.body.surface_areas / cube.body.surface_areas.sum()
+    share = cube.body.surface.areas / cube.body.surface.areas.sum()
     push = np.outer(share, (0.0, 0.0, MASS * GRAVITY))
     scene.push(0, push)
     for _ in range(3):

@@ -121,7 +121,7 @@ def test_stage_says_what_it_holds(tmp_path: Path) -> None:
     assert newton.usd.has_applied_api_schema(points.GetPrim(), "NewtonPointsDeformableSimAPI")
     masses = np.array(points.GetPrim().GetAttribute("physics:masses").Get())
     assert masses.sum(dtype=np.float64) == pytest.approx(mass, rel=EPSILON)
-    np.testing.assert_array_equal(np.array(points.GetPointsAttr().Get()), toy.body.points.astype(np.float32))
+    np.testing.assert_array_equal(np.array(points.GetPointsAttr().Get()), toy.body.cubature.points.astype(np.float32))
     matrix = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(prim)).T
     np.testing.assert_allclose(matrix[:3, :3], toy.scale * TURN, atol=1e-15)
 
@@ -135,7 +135,7 @@ def test_weights_move_splats(tmp_path: Path, kind: str, precision: str) -> None:
     stage = opened(tmp_path / "toy.usdc")
     primvar = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath("/World/toy/Splats"))
     weights = primvar.GetPrimvar("softmode:weights")
-    handles = len(toy.body.handle_degrees)
+    handles = len(toy.body.handles.degrees)
     assert weights.GetElementSize() == handles and weights.GetInterpolation() == "vertex"
     w = np.array(weights.Get(), dtype=np.float64).reshape(-1, handles)
     assert toy.splats is not None
@@ -155,7 +155,7 @@ def test_kaolin_finds_its_arrays(tmp_path: Path) -> None:
     """Types are those of Kaolin's schema; x and F from its arrays are ours; its shares carry mass and stiffness."""
     toy = placed()
     body, count = toy.body, toy.body.point_count
-    handles = len(body.handle_degrees)
+    handles = len(body.handles.degrees)
     write_usd(tmp_path / "toy.usdc", toy)
     stage = opened(tmp_path / "toy.usdc")
     prim = stage.GetPrimAtPath("/World/toy/Splats")
@@ -176,19 +176,19 @@ def test_kaolin_finds_its_arrays(tmp_path: Path) -> None:
     ones = np.concatenate([x, np.ones((count, 1))], axis=1)
     reach = EPSILON * handles * np.abs(t).max()
     moved = x + np.einsum("pj,jki,pi->pk", w, t, ones)
-    np.testing.assert_allclose(moved, body.points + body.evaluate(body.points)[0] @ q, atol=reach)
+    np.testing.assert_allclose(moved, body.cubature.points + body.evaluate(body.cubature.points)[0] @ q, atol=reach)
     f = np.eye(3) + np.einsum("pj,jki->pki", w, t[:, :, :3]) + np.einsum("pjc,jki,pi->pkc", slope, t, ones)
-    own = np.eye(3) + np.einsum("kc,pkd->pcd", q, body.grad_basis.astype(np.float64))
+    own = np.eye(3) + np.einsum("kc,pkd->pcd", q, body.cubature.grad_basis.astype(np.float64))
     np.testing.assert_allclose(f, own, atol=reach * max(1.0, np.abs(slope).max()))
     volume = float(values["appx_vol"])
     assert (values["rhos"] * volume / count).sum() == pytest.approx(MATERIAL.density * body.volume, rel=4 * EPSILON)
     np.testing.assert_allclose(
         values["yms"] * volume / count,
-        MATERIAL.youngs_modulus * body.stiffness_scale * body.weights,
+        MATERIAL.youngs_modulus * body.cubature.stiffness_scale * body.cubature.weights,
         rtol=8 * EPSILON,
     )
     plain = np.array(prim.GetAttribute("kaolin_physics_material:default:yms").Get())
-    np.testing.assert_array_equal(plain, np.float32(MATERIAL.youngs_modulus * body.stiffness_scale))
+    np.testing.assert_array_equal(plain, np.float32(MATERIAL.youngs_modulus * body.cubature.stiffness_scale))
 
 
 def test_kaolin_is_left_out(tmp_path: Path) -> None:
@@ -382,4 +382,4 @@ def test_empty_arrays_are_not_written(tmp_path: Path, kind: str) -> None:
     prim = stage.GetPrimAtPath("/World/toy")
     assert prim.HasAttribute("softmode:body:region_points") == (kind == "regions")
     header = json.loads(prim.GetAttribute("softmode:body:header").Get())
-    assert header["arrays"]["region_points"][1][0] == len(small_body(kind).region_points)
+    assert header["arrays"]["region_points"][1][0] == len(small_body(kind).regions.points)

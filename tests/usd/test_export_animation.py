@@ -117,7 +117,7 @@ def test_handles_hold_the_states(tmp_path: Path, kind: str) -> None:
         expected = np.array([frame[k] for frame in states])
         rounding = np.finfo(float).eps * np.linalg.cond(body.transform) * len(body.transform)
         np.testing.assert_allclose(played.coordinates, expected, atol=rounding * np.abs(expected).max())
-        surface = body.surface_points + body.surface_basis.astype(float) @ expected[2]
+        surface = body.surface.points + body.surface.basis.astype(float) @ expected[2]
         np.testing.assert_allclose(played.points_at(2), surface, atol=1e-12)
     again = add_usd(newton.ModelBuilder(), tmp_path / "a.usdc")  # the first frame as a scene to go on from
     assert [body.material for body in again.bodies.values()] == [MATERIAL, MATERIAL]
@@ -148,7 +148,7 @@ def test_dents_come_back(tmp_path: Path, options: UsdAnimationOptions | None) ->
             animation.record(scene.state, 0.1 * frame)
             bound.update(scene.state)
             means.append(bound.frames()[0, 1].means)
-            surfaces.append(body.surface_points + body.surface_basis.astype(float) @ q)
+            surfaces.append(body.surface.points + body.surface.basis.astype(float) @ q)
     plain, played = read_animation(tmp_path / "a.usdc").bodies
     stage = Usd.Stage.Open(str(tmp_path / "a.usdc"))
     assert not plain.dents_at(0).any() and not stage.GetPrimAtPath(plain.path).HasAttribute("softmode:dents")
@@ -213,7 +213,7 @@ def test_simulation_points_are_baked(tmp_path: Path) -> None:
     for frame in range(FRAMES):
         matrix = np.array(UsdGeom.XformCache(3.0 * frame).GetLocalToWorldTransform(prim.GetPrim()))
         local = np.array(prim.GetPointsAttr().Get(3.0 * frame), dtype=float)
-        expected = body.points + body.evaluate(body.points)[0] @ states[frame][0]
+        expected = body.cubature.points + body.evaluate(body.cubature.points)[0] @ states[frame][0]
         np.testing.assert_allclose(local @ matrix[:3, :3] + matrix[3, :3], expected, atol=2 * EPSILON)
 
 

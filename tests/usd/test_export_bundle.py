@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +21,7 @@ from softmode.usd.handles import (
     rigid_motion,
     world_coordinates,
 )
+from tests.bodies import changed
 from tests.usd.export_scenes import KINDS, assert_same, small_body, some_state
 
 
@@ -41,11 +41,11 @@ def test_signs_of_zeros_survive_the_file(suffix: str, tmp_path: Path) -> None:
 
     The normals of a box are such an array.
     """
-    normals = small_body("affine").surface_normals.copy()
+    normals = small_body("affine").surface.normals.copy()
     axis = np.abs(normals).argmax(axis=1)
     normals = np.where(np.arange(3) == axis[:, None], np.sign(normals), -0.0)
     normals[::5] += 0.0
-    body = dataclasses.replace(small_body("affine"), surface_normals=normals)
+    body = changed(small_body("affine"), surface_normals=normals)
     header, arrays, digest = encode_body(body)
     lost = {name: array + 0.0 if array.dtype.kind == "f" else array for name, array in arrays.items()}
     assert_same(decode_body(header, lost, digest, "test"), body)
@@ -86,7 +86,7 @@ def test_handles_move_points_as_the_functions_do(kind: str) -> None:
     """X + sum_j W_j [X, 1] M_j (and six monomials more) equals X + sum_k b_k q_k; the constant handle is last."""
     body = small_body(kind)
     q = some_state(body)
-    x = body.points
+    x = body.cubature.points
     weight, gradient = handle_weights(body, x)
     assert (weight[:, -1] == 1.0).all() and (gradient[:, -1] == 0.0).all()
     matrices, quadratic = handles_from_coordinates(body, q)
@@ -95,7 +95,7 @@ def test_handles_move_points_as_the_functions_do(kind: str) -> None:
     moved = x + np.einsum("pj,pi,jik->pk", weight, ones, matrices)[:, :3]
     if len(quadratic):
         squares = np.stack([x[:, a] * x[:, b] for a, b in ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (2, 0))], axis=1)
-        curved = [k for k in range(weight.shape[1]) if np.roll(body.handle_degrees, -1)[k] == 2]
+        curved = [k for k in range(weight.shape[1]) if np.roll(body.handles.degrees, -1)[k] == 2]
         moved += np.einsum("pj,pi,jik->pk", weight[:, curved], squares, quadratic)
     rounding = 1e3 * np.finfo(float).eps * np.abs(matrices).max()  # raw functions cancel where they are many
     np.testing.assert_allclose(moved, x + body.evaluate(x)[0] @ q, atol=rounding)
@@ -130,8 +130,8 @@ def test_frame_that_goes_along(kind: str) -> None:
     rotation, translation = rigid_motion(body, q)
     inside = local_coordinates(body, q, rotation, translation, scale)
     np.testing.assert_allclose(world_coordinates(body, inside, rotation, translation, scale), q, atol=1e-14)
-    seen = body.points + body.evaluate(body.points)[0] @ inside
-    there = body.points + body.evaluate(body.points)[0] @ q
+    seen = body.cubature.points + body.evaluate(body.cubature.points)[0] @ inside
+    there = body.cubature.points + body.evaluate(body.cubature.points)[0] @ q
     np.testing.assert_allclose(scale * seen @ rotation.T + translation, there, atol=1e-13)
     assert np.linalg.det(rotation) > 0.0
     assert np.linalg.det(rigid_motion(body, body.affine(np.diag([1.0, 1.0, -1.0])))[0]) > 0.0

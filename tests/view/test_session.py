@@ -327,7 +327,7 @@ def test_a_build_for_pins_goes_on_where_it_was(hanging):
             break
         time.sleep(0.01)
     body = hanging._object(0).body
-    assert body.region_names == ("pin 1",) and hanging.status().notice == ""
+    assert body.regions.names == ("pin 1",) and hanging.status().notice == ""
     assert hanging.pins().keys() == pins.keys() and hanging.pins()[1].error < 0.01 * SIZE
     settle(hanging)
     np.testing.assert_allclose(hanging.surface(), before, atol=0.03 * SIZE)
@@ -562,20 +562,20 @@ def test_a_brush_makes_softer(tmp_path):
     live.pause()
     hit = side(live)
     stiff = live.objects[0].body
-    assert (stiff.stiffness_scale == 1.0).all()
+    assert (stiff.cubature.stiffness_scale == 1.0).all()
     live.paint([hit], 0.1, radius=0.3 * SIZE, depth=0.3 * SIZE)
     finish(live)
     body = live.objects[0].body
     assert "0.1 times as stiff" in live.status().notice
-    near = np.linalg.norm(body.points - hit.rest_point, axis=1)
-    assert body.stiffness_scale[near.argmin()] == 0.1 and body.stiffness_scale[near.argmax()] == 1.0
+    near = np.linalg.norm(body.cubature.points - hit.rest_point, axis=1)
+    assert body.cubature.stiffness_scale[near.argmin()] == 0.1 and body.cubature.stiffness_scale[near.argmax()] == 1.0
     live.save(tmp_path / "painted.npz")
     again = load(tmp_path / "painted.npz")
-    assert np.array_equal(again.body.stiffness_scale, body.stiffness_scale)
+    assert np.array_equal(again.body.cubature.stiffness_scale, body.cubature.stiffness_scale)
     assert again.material is not None and again.material.youngs_modulus == pytest.approx(SOFT.youngs_modulus)
     live.paint([hit], 0.1, radius=0.3 * SIZE, depth=0.3 * SIZE)
     finish(live)
-    assert live.objects[0].body.stiffness_scale.min() == pytest.approx(0.01)
+    assert live.objects[0].body.cubature.stiffness_scale.min() == pytest.approx(0.01)
     with pytest.raises(MaterialError, match=r"0\.001"):
         live.paint([hit], 0.05, radius=0.3 * SIZE, depth=0.3 * SIZE)
     for _ in range(2):

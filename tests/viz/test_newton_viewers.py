@@ -62,7 +62,7 @@ def test_particles_are_to_be_seen(stack: Scene) -> None:
     body, model = cube(), stack.model
     assert model.particle_count == body.surface_count
     assert (model.particle_flags.numpy() & int(newton.ParticleFlags.ACTIVE)).all()
-    spacing = np.sqrt(body.surface_areas.mean())
+    spacing = np.sqrt(body.surface.areas.mean())
     assert (model.particle_radius.numpy() > 0.1 * spacing).all()
     assert (model.particle_radius.numpy() < spacing).all()
 

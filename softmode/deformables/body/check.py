@@ -11,17 +11,12 @@ from softmode.deformables.body.qgmls import FUNCTIONS
 from softmode.errors import BasisError
 
 _KINDS = {
-    "name": str,
-    "volume": float,
-    "kernel": str,
-    "length": float,
-    "envelope_length": float,
-    "gap_blends": bool,
-    "driven_count": int,
-    "region_names": tuple,
-    "fingerprint": str,
-    "provenance": dict,
-    "build_seconds": float,
+    str: "name kernel fingerprint",
+    float: "volume length envelope_length build_seconds",
+    int: "driven_count",
+    bool: "gap_blends",
+    tuple: "region_names",
+    dict: "provenance",
 }
 _FLOAT32 = ("grad_basis", "surface_basis", "detour_lengths")
 _INDICES = ("handle_degrees", "handle_regions", "core_index", "region_index", "hidden_pairs", "detour_pairs")
@@ -36,9 +31,10 @@ def check_fields(body: Mapping[str, Any]) -> None:
     Raises:
         BasisError: If any is wrong.
     """
-    for name, kind in _KINDS.items():
-        if not isinstance(body[name], kind):
-            raise BasisError(f"{name}: expected {kind.__name__}, got {type(body[name]).__name__}")
+    for kind, names in _KINDS.items():
+        for name in names.split():
+            if not isinstance(body[name], kind):
+                raise BasisError(f"{name}: expected {kind.__name__}, got {type(body[name]).__name__}")
 
     def count(*names: str) -> list[int]:
         return [len(body[name]) for name in names]
@@ -50,11 +46,9 @@ def check_fields(body: Mapping[str, Any]) -> None:
     r, volume, weights = body["driven_count"], body["volume"], body["weights"]
     expected = {
         "points": (p, 3),
-        "weights": (p,),
+        "weights stiffness_scale": (p,),
         "grad_basis": (p, n, 3),
-        "stiffness_scale": (p,),
-        "surface_points": (s, 3),
-        "surface_normals": (s, 3),
+        "surface_points surface_normals": (s, 3),
         "surface_areas": (s,),
         "surface_basis": (s, n),
         "mean_basis": (n,),
@@ -65,25 +59,21 @@ def check_fields(body: Mapping[str, Any]) -> None:
         "centres": (k, 3),
         "radii": (k,),
         "handles": (k, j),
-        "handle_degrees": (j,),
-        "handle_regions": (j,),
+        "handle_degrees handle_regions": (j,),
         "transform": (raw, n),
         "material_points": (material, 3),
         "hidden_pairs": (hidden,),
         "material_frame": (3, 3),
-        "detour_pairs": (detours,),
-        "detour_lengths": (detours,),
-        "region_stiffness": (regions,),
-        "region_radii": (regions,),
+        "detour_pairs detour_lengths": (detours,),
+        "region_stiffness region_radii": (regions,),
         "region_cores": (cores, 2, 3),
         "core_index": (cores,),
         "region_points": (samples, 3),
-        "region_index": (samples,),
-        "region_weights": (samples,),
+        "region_index region_weights": (samples,),
         "drive": (r, samples),
         "drive_affine": (regions, r, 4),
     }
-    for name, shape in expected.items():
+    for name, shape in ((name, shape) for names, shape in expected.items() for name in names.split()):
         value = body[name]
         dtype = np.float32 if name in _FLOAT32 else np.int64 if name in _INDICES else np.float64
         if value.shape != shape or value.dtype != dtype:

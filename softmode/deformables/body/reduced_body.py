@@ -17,25 +17,25 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal
+from operator import attrgetter
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
+from softmode.deformables.body.body_fields import GAPS, PLACES, TABLES, made_fields, records_of
 from softmode.deformables.body.check import check_fields
-from softmode.deformables.body.detours import Detours
 from softmode.deformables.body.qgmls import BasisQGMLS
 from softmode.deformables.body.raw_functions import QuadraticFunctions, RawFunctions, SkinningFunctions
-from softmode.deformables.body.regions import Envelope, Region
-from softmode.deformables.body.rkpm import BasisRKPM, KernelName
+from softmode.deformables.body.records import BodyCubature, BodyRegions, BodySurface
+from softmode.deformables.body.regions import Envelope
+from softmode.deformables.body.rkpm import BasisRKPM
 from softmode.deformables.body.skinning_weights import SkinningWeights
-from softmode.deformables.body.visibility import Visibility
 from softmode.errors import AssetError, BasisError, ConfigError
 from softmode.files import damage_errors, read_archive, write_archive
 
 Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 Scalar = str | int | float | bool | None
 
 FORMAT, FORMAT_VERSION = "softmode.ReducedBody", 5
@@ -53,26 +53,20 @@ _CHUNK = 2048
 
 @dataclass(frozen=True, kw_only=True)
 class ReducedBody:
-    """A deformable body ready to simulate: arrays only, float64 unless said, body frame, SI units."""
+    """A deformable body ready to simulate: five records and what belongs to none; body frame, SI units, float64."""
 
     name: str
     """Name for messages and reports."""
-    points: Array
-    """Cubature points [m], shape (P, 3)."""
-    weights: Array
-    """Their volumes [m^3], > 0, sum = `volume`, shape (P,)."""
-    grad_basis: NDArray[np.float32]
-    """Gradients of the functions at the cubature points [1/m], shape (P, n, 3), float32."""
-    stiffness_scale: Array
-    """Young's modulus relative to the body's, shape (P,)."""
-    surface_points: Array
-    """Surface samples [m], shape (S, 3)."""
-    surface_normals: Array
-    """Outward unit normals, shape (S, 3)."""
-    surface_areas: Array
-    """Areas [m^2], sum = surface area, shape (S,)."""
-    surface_basis: NDArray[np.float32]
-    """Functions at the surface samples, shape (S, n), float32."""
+    cubature: BodyCubature
+    """Points at which elastic energy is summed."""
+    surface: BodySurface
+    """Samples of the surface."""
+    kernels: BasisRKPM | BasisQGMLS
+    """Kernels that the raw functions are made of."""
+    handles: SkinningWeights
+    """Weights W_j in the kernels: constant handle, regions, eigenmodes, responses."""
+    regions: BodyRegions
+    """Regions that were known when it was built."""
     volume: float
     """Volume [m^3]."""
     mean_basis: Array
@@ -87,18 +81,6 @@ class ReducedBody:
     """Corners of the bounding box in the body frame [m], shape (2, 3)."""
     offset: Array
     """Origin of the body frame in asset coordinates [m]: X_body = X_asset - offset, shape (3,)."""
-    centres: Array
-    """Kernel centres [m], shape (K, 3)."""
-    radii: Array
-    """Nominal kernel radii [m], shape (K,); of Q-GMLS those of the supports."""
-    kernel: KernelName | Literal["qgmls"]
-    """Bell of the kernels, or "qgmls" for those of :class:`BasisQGMLS`."""
-    handles: Array
-    """Coefficients of the weights W_j in the kernels, shape (K, J): constant handle, regions, eigenmodes, responses."""
-    handle_degrees: Indices
-    """Degree of the monomials each weight carries, 0 (translation), 1 (affine) or 2 (quadratic), int64, shape (J,)."""
-    handle_regions: Indices
-    """Exact region whose blend is part of a weight, counted among the exact ones, or -1, int64, shape (J,)."""
     transform: Array
     """b = (W_0 Z, ..., W_J Z) @ transform, Z monomials in (X, Y, Z) over `length`; shape (raw functions, n). Those of
     Q-GMLS follow after the Z of the constant handle."""
@@ -106,47 +88,12 @@ class ReducedBody:
     """Unit of length of the raw functions [m]."""
     driven_count: int
     """Number r of driven functions: the first r take every value on the exact regions, the others vanish there."""
-    region_names: tuple[str, ...]
-    """Names of the regions given at build time, R of them."""
-    region_stiffness: Array
-    """Stiffness kappa / E [1/m^2] of soft regions, 0 for exact ones, shape (R,)."""
-    region_radii: Array
-    """How far each region reaches beyond its cores [m], shape (R,)."""
-    region_cores: Array
-    """Boxes and points (boxes of no extent) that make up the regions [m], shape (C, 2, 3)."""
-    core_index: Indices
-    """Region of each core, int64, shape (C,)."""
-    region_points: Array
-    """Points that sample the regions [m], shape (N, 3)."""
-    region_index: Indices
-    """Region of each of these points, int64, shape (N,)."""
-    region_weights: Array
-    """Their volumes [m^3], of soft regions times relative Young's modulus; corners of exact ones have none; (N,)."""
-    drive: Array
-    """q[:r] = drive @ u for displacements u of the region points: least squares, shape (r, N)."""
-    drive_affine: Array
-    """q[:r] = sum_i drive_affine[i] @ vstack([(A_i - I)^T, t_i]) for regions moved by x = A_i X + t_i, (R, r, 4)."""
     fingerprint: str
     """sha256 of the quadrature, the fields, the options and the regions."""
     provenance: dict[str, Scalar]
     """What went in, what was measured, what was lost."""
     build_seconds: float
     """Wall time of the build [s]."""
-    envelope_length: float = 0.0
-    """Distance from exact regions at which the envelope of the functions is one [m]; 0 without such regions, and in
-    files of versions 2 and 3, whose envelope is d / (d + `length`)."""
-    gap_blends: bool = True
-    """Whether blends between exact regions change over the whole gap; in files before version 5 they do not."""
-    material_points: Array = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
-    """Points of the material [m], shape (N, 3); empty where every kernel acts on all within its support."""
-    hidden_pairs: Indices = dataclasses.field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    """Kernel * N + point of every kernel and point of the material, within its support, that a gap divides; (H,)."""
-    material_frame: Array = dataclasses.field(default_factory=lambda: np.eye(3))
-    """Takes positions to coordinates in which neighbouring points are one apart, shape (3, 3) [1/m]."""
-    detour_pairs: Indices = dataclasses.field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    """Kernel * N + point of every kernel and point of the material that no straight line joins; ascending, (D,)."""
-    detour_lengths: NDArray[np.float32] = dataclasses.field(default_factory=lambda: np.zeros(0, dtype=np.float32))
-    """What is added to the distance of each pair [m], > 0, shape (D,)."""
     sources: Mapping[str, NDArray[Any]] | None = dataclasses.field(default=None, repr=False, compare=False)
     """What it was built from, for :func:`softmode.deformables.hold`, or None; see ``reduction.sources``."""
 
@@ -156,12 +103,12 @@ class ReducedBody:
 
         Gradients at the centre of splats so wide are off by 2 % of the mean gradient, by 5 % of one splat in a hundred.
         """
-        return 0.25 * float(np.median(self.radii))
+        return 0.25 * float(np.median(self.kernels.radii))
 
     @property
     def function_count(self) -> int:
         """Number of scalar functions n."""
-        return self.grad_basis.shape[1]
+        return self.cubature.grad_basis.shape[1]
 
     def serves_ratio(self, poissons_ratio: float) -> bool:
         """Return whether functions chosen by elastic energy were made for about this Poisson's ratio.
@@ -181,81 +128,53 @@ class ReducedBody:
     @property
     def point_count(self) -> int:
         """Number of cubature points P."""
-        return len(self.points)
+        return len(self.cubature.points)
 
     @property
     def surface_count(self) -> int:
         """Number of surface samples S."""
-        return len(self.surface_points)
-
-    @cached_property
-    def regions(self) -> tuple[Region, ...]:
-        """The regions, in the body frame."""
-        found = []
-        for i, name in enumerate(self.region_names):
-            core = self.region_cores[self.core_index == i]
-            solid = len(core) == 1 and (core[0, 1] > core[0, 0]).any()
-            stiffness = float(self.region_stiffness[i]) or None
-            radius = float(self.region_radii[i])
-            form = {"box": core[0]} if solid else {"points": core[:, 0]}
-            found.append(Region(name=name, radius=radius, stiffness=stiffness, **form))
-        return tuple(found)
-
-    @cached_property
-    def _envelope(self) -> Envelope | None:
-        exact = tuple(region for region in self.regions if region.stiffness is None)
-        if not exact:
-            return None
-        return Envelope(exact, self.envelope_length or self.length, not self.envelope_length, self.gap_blends)
-
-    @cached_property
-    def kernels(self) -> BasisRKPM:
-        """The reproducing kernels.
-
-        Raises:
-            ConfigError: If the functions are those of Q-GMLS.
-        """
-        if self.kernel == "qgmls":
-            raise ConfigError(
-                f"body {self.name!r}: functions of Q-GMLS are made of no skinning weights and reproducing kernels",
-                hint="build it with other handles, such as handles='local'",
-            )
-        visibility = detours = None
-        if len(self.hidden_pairs):
-            visibility = Visibility(points=self.material_points, hidden=self.hidden_pairs)
-        if len(self.detour_pairs):
-            detours = Detours(
-                points=self.material_points,
-                frame=self.material_frame,
-                pairs=self.detour_pairs,
-                lengths=self.detour_lengths,
-            )
-        return BasisRKPM(
-            centres=self.centres, radii=self.radii, kernel=self.kernel, visibility=visibility, detours=detours
-        )
+        return len(self.surface.points)
 
     @property
     def skinned(self) -> bool:
         """Whether the functions are products of skinning weights; those of Q-GMLS are none."""
-        return self.kernel != "qgmls"
+        return isinstance(self.kernels, BasisRKPM)
 
     @cached_property
     def raw(self) -> RawFunctions:
         """What the functions are combinations of."""
-        return (
-            self._skinning
-            if self.skinned
-            else QuadraticFunctions(kernels=BasisQGMLS(centres=self.centres, radii=self.radii), length=self.length)
-        )
+        if isinstance(self.kernels, BasisQGMLS):
+            return QuadraticFunctions(kernels=self.kernels, length=self.length)
+        return self._skinning
 
     @cached_property
     def _skinning(self) -> SkinningFunctions:
-        skin = SkinningWeights(coefficients=self.handles, degrees=self.handle_degrees, blends=self.handle_regions)
-        return SkinningFunctions(kernels=self.kernels, skin=skin, envelope=self._envelope, length=self.length)
+        return SkinningFunctions(
+            kernels=self.reproducing_kernels, skin=self.handles, envelope=self._envelope, length=self.length
+        )
+
+    @cached_property
+    def _envelope(self) -> Envelope | None:
+        return self.regions.envelope(self.length)
+
+    @property
+    def reproducing_kernels(self) -> BasisRKPM:
+        """The kernels of a body that is skinned.
+
+        Raises:
+            ConfigError: If the functions are those of Q-GMLS.
+        """
+        if isinstance(self.kernels, BasisRKPM):
+            return self.kernels
+        raise ConfigError(
+            f"body {self.name!r}: functions of Q-GMLS are made of no skinning weights and reproducing kernels",
+            hint="build it with other handles, such as handles='local'",
+        )
 
     @property
     def _divided(self) -> bool:
-        return len(self.hidden_pairs) + len(self.detour_pairs) > 0
+        kernels = self.kernels
+        return isinstance(kernels, BasisRKPM) and not (kernels.visibility is None and kernels.detours is None)
 
     def evaluate(self, points: ArrayLike, *, outside: str = "clamp") -> tuple[Array, Array]:
         """Evaluate the functions and their gradients at rest points of the body frame.
@@ -326,7 +245,7 @@ class ReducedBody:
             ConfigError: If the functions are those of Q-GMLS.
         """
         skinning, (_, inner, at, _) = self._skinning, self._within_reach(points)
-        weight = np.empty((len(inner), len(self.handle_degrees)))
+        weight = np.empty((len(inner), len(self.handles.degrees)))
         gradient = np.empty((*weight.shape, 3))
         for i in range(0, len(inner), _CHUNK):
             weight[i : i + _CHUNK], gradient[i : i + _CHUNK] = skinning.weights(
@@ -365,8 +284,8 @@ class ReducedBody:
 
         Kernels sit inside the body, so that corners of its own surface may lie a little beyond their reach.
         """
-        apart = KDTree(self.surface_points).query(points)[0]
-        return self.covers(points) | (apart <= np.sqrt(self.surface_areas.mean()))
+        apart = KDTree(self.surface.points).query(points)[0]
+        return self.covers(points) | (apart <= np.sqrt(self.surface.areas.mean()))
 
     def affine(self, matrix: ArrayLike, translation: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
         """Return the coordinates q (n, 3) of x = A X + t, with A (3, 3) and t (3,) [m] in the body frame."""
@@ -388,10 +307,10 @@ class ReducedBody:
             ConfigError: If the vectors are not finite or of another shape.
             BasisError: If the cubature points are too few to tell the functions apart.
         """
-        vectors = np.asarray(field(self.points), dtype=np.float64)
-        if vectors.shape != self.points.shape or not np.isfinite(vectors).all():
-            raise ConfigError(f"field: expected finite vectors {self.points.shape}, got shape {vectors.shape}")
-        return self.fit(vectors, self.points, self.weights)
+        vectors = np.asarray(field(self.cubature.points), dtype=np.float64)
+        if vectors.shape != self.cubature.points.shape or not np.isfinite(vectors).all():
+            raise ConfigError(f"field: expected finite vectors {self.cubature.points.shape}, got shape {vectors.shape}")
+        return self.fit(vectors, self.cubature.points, self.cubature.weights)
 
     def fit(self, values: Array, points: Array, weights: Array) -> Array:
         """Return the coordinates (n, C) of the functions of the span that are nearest to values in the mean square.
@@ -414,46 +333,14 @@ class ReducedBody:
             )
         return found
 
-    def region_rows(self, name: str) -> NDArray[np.intp]:
-        """Return which rows of `region_points` sample a region.
-
-        Raises:
-            ConfigError: If the body has no region of that name.
-        """
-        if name not in self.region_names:
-            raise ConfigError(f"name: expected one of {self.region_names}, got {name!r}")
-        return np.flatnonzero(self.region_index == self.region_names.index(name))
-
-    def driven_coordinates(self, displacements: ArrayLike) -> Array:
-        """Return the driven coordinates (r, 3) [m] nearest to displacements (N, 3) [m] of the region points."""
-        u = np.asarray(displacements, dtype=np.float64)
-        if u.shape != self.region_points.shape:
-            raise ConfigError(f"displacements: expected shape {self.region_points.shape}, got {u.shape}")
-        return self.drive @ u
-
-    def driven_affine(self, matrices: ArrayLike, translations: ArrayLike) -> Array:
-        """Return the driven coordinates (r, 3) [m] of regions moved by x = A X + t, each its own, body frame.
-
-        Args:
-            matrices: A of every region, shape (R, 3, 3); those of soft regions are not used.
-            translations: t of every region [m], shape (R, 3).
-        """
-        a, t = np.asarray(matrices, dtype=np.float64), np.asarray(translations, dtype=np.float64)
-        count = len(self.region_names)
-        if a.shape != (count, 3, 3) or t.shape != (count, 3):
-            raise ConfigError(f"matrices ({count}, 3, 3), translations ({count}, 3): got {a.shape} and {t.shape}")
-        motion = np.concatenate([(a - np.eye(3)).transpose(0, 2, 1), t[:, None]], axis=1)
-        return np.einsum("irk,ikc->rc", self.drive_affine, motion)
-
     def fields(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         """Return what is no array, with the format and its version, ready for JSON, and the arrays by name."""
-        values = {f.name: getattr(self, f.name) for f in _own_fields()}
-        arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
-        told = {name: value for name, value in values.items() if name not in arrays}
-        empty = set().union(*(names for name, names in _TABLES.items() if not len(getattr(self, name))))
+        values = self.flat()
+        empty = set().union(*(names for name, names in TABLES.items() if not len(values[name])))
         if self._divided:
             empty -= {"material_points"}
-        arrays = {name: value for name, value in arrays.items() if name not in empty}
+        arrays = {name: v for name, v in values.items() if isinstance(v, np.ndarray) and name not in empty}
+        told = {name: value for name, value in values.items() if not isinstance(value, np.ndarray)}
         return {"format": FORMAT, "version": FORMAT_VERSION, **told}, arrays
 
     @classmethod
@@ -472,20 +359,38 @@ class ReducedBody:
             AssetError: If they are not those of a body.
         """
         header = {"envelope_length": 0.0, "gap_blends": False, **header}
-        names = {f.name for f in _own_fields()}
-        for table in _TABLES.values():
+        names = {*PLACES}
+        for table in TABLES.values():
             if not arrays.keys() & (table - {"material_points"}):
                 names -= table
-        if arrays.keys() & set().union(*_TABLES.values()):
+        if arrays.keys() & set().union(*TABLES.values()):
             names |= {"material_points"}
         if set(header) | set(arrays) != names or set(header) & set(arrays):
             wrong = sorted(names ^ (set(header) | set(arrays)))
             raise AssetError(f"{source}: fields {wrong} do not match", hint=hint)
         with damage_errors(source, hint=hint):
-            values: dict[str, Any] = {**header, **arrays, "region_names": tuple(header["region_names"])}
-            body = cls(**values)
-            body.check()
-        return body
+            return cls.from_flat({**header, **arrays, "region_names": tuple(header["region_names"])})
+
+    def flat(self) -> dict[str, Any]:
+        """Return all that makes up the body, without its sources, by the names and in the order that its file has."""
+        made = made_fields(self.kernels, self.regions)
+        return {name: attrgetter(place)(self) if place else made[name] for name, place in PLACES.items()}
+
+    @classmethod
+    def from_flat(cls, values: Mapping[str, Any], **own: Any) -> Self:
+        """Return the body of what :meth:`flat` returned, checked.
+
+        Args:
+            values: Its fields by name.
+            own: Its sources, and fields that a class of its own adds.
+
+        Raises:
+            BasisError: If any is wrong.
+            ConfigError: If a region is.
+        """
+        values = {**GAPS, **values}
+        check_fields(values)
+        return cls(**records_of(values), **own)
 
     def save(
         self, path: str | os.PathLike[str], *, beside: Mapping[str, NDArray[Any]] | None = None, sources: bool = True
@@ -533,16 +438,4 @@ class ReducedBody:
         Raises:
             BasisError: If any is wrong.
         """
-        check_fields({f.name: getattr(self, f.name) for f in _own_fields()})
-
-
-_TABLES = {
-    "hidden_pairs": {"material_points", "hidden_pairs"},
-    "detour_pairs": {"material_points", "material_frame", "detour_pairs", "detour_lengths"},
-}
-"""Arrays that only the file of a body has whose kernels do not act across gaps, or go around corners."""
-
-
-def _own_fields() -> list[dataclasses.Field[Any]]:
-    """Return the fields that make up a body, without its sources."""
-    return [f for f in dataclasses.fields(ReducedBody) if f.name != "sources"]
+        check_fields(self.flat())

@@ -74,13 +74,13 @@ def dent_lengths(body: ReducedBody) -> Array:
 
     Zero on exact regions, which are where they are driven to, and rigid.
     """
-    free = (np.abs(body.surface_basis[:, body.driven_count :]) > VANISHING).any(axis=1)
+    free = (np.abs(body.surface.basis[:, body.driven_count :]) > VANISHING).any(axis=1)
     return np.where(free, DENT_FACTOR * np.minimum(resolved_size(body), WALL_SHARE * thickness(body)), 0.0)
 
 
 def neighbourhoods(body: ReducedBody) -> list[tuple[NDArray[np.int64], Array]]:
     """Return the samples around each that face the same way within 60 degrees, and their weights, of sum CARRIED."""
-    x, n, area = body.surface_points, body.surface_normals, body.surface_areas
+    x, n, area = body.surface.points, body.surface.normals, body.surface.areas
     radius = np.maximum(COVER * resolved_size(body), 1.5 * np.sqrt(area))
     found = []
     for s, near in enumerate(KDTree(x).query_ball_point(x, radius)):
@@ -92,7 +92,7 @@ def neighbourhoods(body: ReducedBody) -> list[tuple[NDArray[np.int64], Array]]:
 
 def mean_curvature(body: ReducedBody) -> Array:
     """Return the mean curvature at the samples [1/m], from the eight nearest whose normals are within 45 degrees."""
-    x, n = body.surface_points, body.surface_normals
+    x, n = body.surface.points, body.surface.normals
     near = KDTree(x).query(x, min(9, len(x)))[1].reshape(len(x), -1)[:, 1:]
     d, dn = x[near] - x[:, None], n[near] - n[:, None]
     same = np.einsum("ik,ijk->ij", n, n[near]) > 0.7
@@ -152,7 +152,7 @@ def dent_weights(body: ReducedBody, points: ArrayLike) -> DentWeights:
         body: The body.
         points: Rest points in the body frame [m], shape (N, 3).
     """
-    x, surface, normals = np.asarray(points, dtype=np.float64), body.surface_points, body.surface_normals
+    x, surface, normals = np.asarray(points, dtype=np.float64), body.surface.points, body.surface.normals
     near = KDTree(surface).query(x, min(4 * NEAREST, len(surface)))[1]
     arm = x[:, None] - surface[near]
     height = np.einsum("nkd,nkd->nk", arm, normals[near])

@@ -161,8 +161,8 @@ def thickness(body: ReducedBody) -> np.ndarray:
     The distance along the inner normal to the first samples that look the other way; the body's size where there are
     none.
     """
-    x, normals = body.surface_points, body.surface_normals
-    beside = (1.5**2) * body.surface_areas.mean()
+    x, normals = body.surface.points, body.surface.normals
+    beside = (1.5**2) * body.surface.areas.mean()
     out = np.full(len(x), float(np.linalg.norm(np.ptp(body.bounds, axis=0))))
     for s, n in enumerate(normals):
         away = x[s] - x
@@ -176,5 +176,5 @@ def neighbours(body: ReducedBody) -> np.ndarray:
     """Return the nearest surface samples of each at rest, itself first, shape (surface_count, NEIGHBOURS); -1 pads."""
     count = min(kernels.NEIGHBOURS, body.surface_count)
     out = np.full((body.surface_count, kernels.NEIGHBOURS), -1)
-    out[:, :count] = KDTree(body.surface_points).query(body.surface_points, count)[1]
+    out[:, :count] = KDTree(body.surface.points).query(body.surface.points, count)[1]
     return out

@@ -186,12 +186,12 @@ def add_reduced_body(
     q = body.affine(s * R, p)
     # the velocity field v + omega x (R s X) as coordinates: affine() of I + A subtracts the identity again
     qd = body.affine(np.eye(3) + spin @ (s * R), v0)
-    x = s * body.surface_points @ R.T + p
+    x = s * body.surface.points @ R.T + p
     v = v0 + x @ spin.T - p @ spin.T
     if velocity_field is not None:
         more = body.project(lambda X: velocity_field(s * X))
-        qd, v = qd + more, v + body.surface_basis @ more
-    radius = 0.5 * s * float(np.sqrt(body.surface_areas.mean())) if particle_radius is None else particle_radius
+        qd, v = qd + more, v + body.surface.basis @ more
+    radius = 0.5 * s * float(np.sqrt(body.surface.areas.mean())) if particle_radius is None else particle_radius
     mass = material.density * s**3 * body.volume / body.surface_count
 
     particle_start = builder.particle_count
@@ -325,7 +325,7 @@ def drive_regions(
         translations: Vector t of each region [m], shape (region_count, 3).
     """
     data = soft(model)
-    q = body.driven_affine(float(data.scale.numpy()[instance]) * np.asarray(matrices, float), translations)
+    q = body.regions.driven_affine(float(data.scale.numpy()[instance]) * np.asarray(matrices, float), translations)
     start = int(data.function_start.numpy()[instance])
     target = soft(control).q_driven
     target[start : start + len(q)].assign(q)

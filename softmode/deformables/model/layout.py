@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from operator import attrgetter
 from typing import Any
 
 import newton
@@ -165,7 +166,7 @@ def lay_out_bases(model: newton.Model, layout: Layout, contact_max: int) -> Basi
     bodies, stride, device = layout.bodies, LANES * layout.block_count, model.device
 
     def joined(name: str) -> Array:
-        return np.concatenate([getattr(body, name) for body in bodies])
+        return np.concatenate([attrgetter(name)(body) for body in bodies])
 
     def padded(values: Sequence[np.ndarray]) -> np.ndarray:
         return np.concatenate([_padded(v, stride) for v in values])
@@ -183,25 +184,25 @@ def lay_out_bases(model: newton.Model, layout: Layout, contact_max: int) -> Basi
     linear = np.zeros((len(bodies), stride, 4))
     for a, body in enumerate(bodies):
         linear[a, : body.function_count] = body.linear_coordinates
-    inner = [inner_offsets(body.surface_points, body.surface_normals, _size(body)) for body in bodies]
+    inner = [inner_offsets(body.surface.points, body.surface.normals, _size(body)) for body in bodies]
     inner_rows = [
-        body.evaluate(body.surface_points + offset)[0] - body.surface_basis
+        body.evaluate(body.surface.points + offset)[0] - body.surface.basis
         for body, offset in zip(bodies, inner, strict=True)
     ]
-    gradient = across(padded([body.grad_basis for body in bodies]))
+    gradient = across(padded([body.cubature.grad_basis for body in bodies]))
     given: dict[str, Any] = {
         "gradient": gradient,
-        "point_weight": joined("weights"),
-        "stiffness_scale": joined("stiffness_scale"),
+        "point_weight": joined("cubature.weights"),
+        "stiffness_scale": joined("cubature.stiffness_scale"),
         "mean": blocks(padded([body.mean_basis[None] for body in bodies])),
         "linear": linear,
-        "row": blocks(np.concatenate([padded([body.surface_basis for body in bodies]), pin_rows, dynamic])),
-        "row_point": np.concatenate([joined("surface_points"), pin_points, np.zeros((contact_rows, 3))]),
-        "row_area": np.append(joined("surface_areas"), np.zeros(len(pin_points))),
+        "row": blocks(np.concatenate([padded([body.surface.basis for body in bodies]), pin_rows, dynamic])),
+        "row_point": np.concatenate([joined("surface.points"), pin_points, np.zeros((contact_rows, 3))]),
+        "row_area": np.append(joined("surface.areas"), np.zeros(len(pin_points))),
         "inner_row": blocks(padded(inner_rows)),
         "inner_point": np.concatenate(inner),
-        "row_normal": joined("surface_normals"),
-        "row_gradient": across(padded([body.evaluate(body.surface_points)[1] for body in bodies])),
+        "row_normal": joined("surface.normals"),
+        "row_gradient": across(padded([body.evaluate(body.surface.points)[1] for body in bodies])),
     }
     if device.is_cuda:
         given["gradient_across"] = gradient.transpose(1, 2, 0, 3)
@@ -216,8 +217,8 @@ def surface_stiffness(bodies: Sequence[ReducedBody]) -> np.ndarray:
     That of the nearest cubature point. Contact alone reads it, so that it is no part of ``Basis``: a CPU kernel copies
     its structs in every thread.
     """
-    nearest = [KDTree(body.points).query(body.surface_points)[1] for body in bodies]
-    return np.concatenate([body.stiffness_scale[index] for body, index in zip(bodies, nearest, strict=True)])
+    nearest = [KDTree(body.cubature.points).query(body.surface.points)[1] for body in bodies]
+    return np.concatenate([body.cubature.stiffness_scale[index] for body, index in zip(bodies, nearest, strict=True)])
 
 
 def _size(body: ReducedBody) -> float:

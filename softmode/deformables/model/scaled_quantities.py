@@ -39,12 +39,12 @@ class ScaledQuantities:
         asset, bodies, size, device = layout.asset, layout.bodies, layout.size, model.device
         rest = {
             "volume": np.array([body.volume for body in bodies])[asset],
-            "area": np.array([body.surface_areas.sum() for body in bodies])[asset],
+            "area": np.array([body.surface.areas.sum() for body in bodies])[asset],
             "size": size,
             "tolerance": tolerance * size,
             "margin": margin * size,
             "smoothing": smoothing * size,
-            "spacing": np.array([np.sqrt(body.surface_areas.mean()) for body in bodies])[asset],
+            "spacing": np.array([np.sqrt(body.surface.areas.mean()) for body in bodies])[asset],
             "radius": self._rest_radii(),
         }
         self.rest = allocate(kernels.RestQuantities, "", {}, device, given=rest)

@@ -57,4 +57,4 @@ def set_velocity(
     own.qd[first : first + count].assign(qd)
     own.dt_before[instance : instance + 1].zero_()  # no step led here: BDF2 starts over
     particle = int(data.particle_start.numpy()[instance])
-    present(state.particle_qd)[particle : particle + body.surface_count].assign(body.surface_basis @ qd)
+    present(state.particle_qd)[particle : particle + body.surface_count].assign(body.surface.basis @ qd)

@@ -94,7 +94,8 @@ def interior_from_surface(body: ReducedBody, *, point_count: int = 4000) -> Inte
     edges = extent / shape
     axes = [low[d] + (np.arange(shape[d]) + 0.5) * edges[d] for d in range(3)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    inside = grid[winding_numbers(body, grid) > 0.5]
+    around = winding_numbers(grid, body.surface.points, body.surface.normals, body.surface.areas)
+    inside = grid[around > 0.5]
     if len(inside) < 4:
         raise BasisError(
             f"body {body.name!r}: its surface samples enclose nothing", hint="Build the body again, with more samples."
@@ -103,17 +104,23 @@ def interior_from_surface(body: ReducedBody, *, point_count: int = 4000) -> Inte
     return Interior(points=inside, weights=weights, spacing=float(edges.prod() ** (1.0 / 3.0)), exact=False)
 
 
-def winding_numbers(body: ReducedBody | Quadrature, points: Array) -> Array:
-    """Return how often the surface samples of a body or quadrature wind around points (N, 3) [m], shape (N,).
+def winding_numbers(points: Array, samples: Array, normals: Array, areas: Array) -> Array:
+    """Return how often samples of a surface wind around points (N, 3) [m], shape (N,).
 
     Within the radius of a sample's own disc the distance is held at that radius, so that no sample outweighs the rest.
+
+    Args:
+        points: Where to count [m], shape (N, 3).
+        samples: Samples of the surface [m], shape (S, 3).
+        normals: Their outward unit normals, shape (S, 3).
+        areas: Their areas [m^2], shape (S,).
     """
     found = np.empty(len(points))
-    strength = body.surface_normals * body.surface_areas[:, None]
-    near = body.surface_areas / np.pi
-    step = max(1, _PAIRS_PER_CHUNK // max(len(body.surface_points), 1))
+    strength = normals * areas[:, None]
+    near = areas / np.pi
+    step = max(1, _PAIRS_PER_CHUNK // max(len(samples), 1))
     for i in range(0, len(points), step):
-        away = body.surface_points[None] - points[i : i + step, None]
+        away = samples[None] - points[i : i + step, None]
         distance_sq = np.maximum(np.einsum("nsi,nsi->ns", away, away), near)
         found[i : i + step] = (np.einsum("nsi,si->ns", away, strength) / distance_sq**1.5).sum(axis=1)
     return found / (4.0 * np.pi)

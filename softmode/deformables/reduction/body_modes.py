@@ -24,8 +24,9 @@ def soft_modes(body: ReducedBody, count: int | None = None) -> tuple[Array, Arra
         (rho V); and the lowest modes, of unit energy q . K q = 1, as coordinates q [m^(-1/2)], shape (count, n, 3).
     """
     free = slice(body.driven_count, None)
-    gradient = body.grad_basis.astype(np.float64)[:, free].transpose(1, 2, 0)
-    value, mode = elastic_modes(reduced_stiffness(gradient, body.weights * body.stiffness_scale, POISSON_RATIO))
+    few = body.cubature
+    gradient = few.grad_basis.astype(np.float64)[:, free].transpose(1, 2, 0)
+    value, mode = elastic_modes(reduced_stiffness(gradient, few.weights * few.stiffness_scale, POISSON_RATIO))
     count = len(value) if count is None else min(count, len(value))
     q = np.zeros((count, body.function_count, 3))
     q[:, free] = mode[:, :count].T.reshape(count, 3, body.function_count - body.driven_count).transpose(0, 2, 1)
@@ -37,4 +38,4 @@ def surface_modes(body: ReducedBody) -> Array:
 
     Forces f on the samples that balance each other move them by u with f . u = sum_m (f . mode_m)^2 / E.
     """
-    return np.einsum("sn,mna->sam", body.surface_basis.astype(np.float64), soft_modes(body)[1], optimize=True)
+    return np.einsum("sn,mna->sam", body.surface.basis.astype(np.float64), soft_modes(body)[1], optimize=True)

@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from threadpoolctl import threadpool_limits
 
-from softmode.deformables.body.qgmls import BasisQGMLS
+from softmode.deformables.body.records import BodyCubature, BodyRegions, BodySurface
 from softmode.deformables.body.reduced_body import FORMAT_VERSION, ReducedBody, Scalar
 from softmode.deformables.body.regions import Region
-from softmode.deformables.body.rkpm import BasisRKPM
 from softmode.deformables.quadrature.octants import octants_of
 from softmode.deformables.quadrature.quadrature_grid import Quadrature
 from softmode.deformables.reduction.basis import BodyBasis, Domain, make_body_basis
@@ -193,50 +192,46 @@ def _build(
         chosen = _cubature(volumes, basis, stiffness, options, quick=quick)
         stage("cubature")
         function_count = basis.gradient.shape[1]
-        cores = [region.cores for region in regions]
         body = ReducedBody(
             name=name,
-            points=points[chosen.index],
-            weights=chosen.weights,
-            grad_basis=basis.gradient[chosen.index].astype(np.float32),
-            stiffness_scale=stiffness[chosen.index],
-            surface_points=quadrature.surface_points - offset,
-            surface_normals=quadrature.surface_normals.copy(),
-            surface_areas=quadrature.surface_areas.copy(),
-            surface_basis=np.zeros((len(quadrature.surface_points), function_count), dtype=np.float32),
+            cubature=BodyCubature(
+                points=points[chosen.index],
+                weights=chosen.weights,
+                grad_basis=basis.gradient[chosen.index].astype(np.float32),
+                stiffness_scale=stiffness[chosen.index],
+            ),
+            surface=BodySurface(
+                points=quadrature.surface_points - offset,
+                normals=quadrature.surface_normals.copy(),
+                areas=quadrature.surface_areas.copy(),
+                basis=np.zeros((len(quadrature.surface_points), function_count), dtype=np.float32),
+            ),
+            kernels=basis.kernels,
+            handles=basis.weights,
+            regions=BodyRegions(
+                parts=regions,
+                points=samples.points,
+                index=samples.index,
+                weights=samples.weights,
+                drive=basis.drive,
+                drive_affine=basis.drive_affine,
+                envelope_length=basis.envelope_length,
+            ),
             volume=quadrature.volume,
             mean_basis=basis.functions.mean,
             linear_coordinates=basis.functions.linear,
             eigenvalues=basis.eigenvalues,
             bounds=bounds,
             offset=offset,
-            centres=basis.kernels.centres,
-            radii=basis.kernels.radii,
-            kernel=options.kernel if isinstance(basis.kernels, BasisRKPM) else "qgmls",
-            handles=basis.weights.coefficients,
-            handle_degrees=basis.weights.degrees,
-            handle_regions=basis.weights.blends,
             transform=basis.functions.transform,
             length=length,
             driven_count=basis.functions.driven_count,
-            envelope_length=basis.envelope_length,
-            region_names=tuple(region.name for region in regions),
-            region_stiffness=np.array([region.stiffness or 0.0 for region in regions], dtype=np.float64),
-            region_radii=np.array([region.radius for region in regions], dtype=np.float64),
-            region_cores=np.concatenate([np.zeros((0, 2, 3)), *cores]),
-            core_index=np.repeat(np.arange(len(regions), dtype=np.int64), [len(core) for core in cores]),
-            region_points=samples.points,
-            region_index=samples.index,
-            region_weights=samples.weights,
-            drive=basis.drive,
-            drive_affine=basis.drive_affine,
             fingerprint=fingerprint,
             provenance={},
             build_seconds=0.0,
             sources=pack_sources(sources),
-            **_bounded(basis.kernels),
         )
-        surface = body.evaluate(body.surface_points)[0]
+        shown = body.evaluate(body.surface.points)[0].astype(np.float32)
         stage("surface")
     provenance: dict[str, Scalar] = {
         **{f"quadrature_{key}": v for key, v in quadrature.report.items() if isinstance(v, str | int | float | bool)},
@@ -255,7 +250,7 @@ def _build(
     }
     return dataclasses.replace(
         body,
-        surface_basis=surface.astype(np.float32),
+        surface=dataclasses.replace(body.surface, basis=shown),
         provenance=provenance,
         build_seconds=time.perf_counter() - start,
     )
@@ -340,18 +335,6 @@ def _cubature(volumes: Array, basis: BodyBasis, stiffness: Array, options: Build
             stacklevel=4,
         )
     return best
-
-
-def _bounded(kernels: BasisRKPM | BasisQGMLS) -> dict[str, NDArray]:
-    """Return the fields of a body whose kernels do not act across gaps, or whose distances are not straight lines."""
-    found: dict[str, NDArray] = {}
-    if isinstance(kernels, BasisRKPM) and kernels.visibility is not None:
-        found |= {"material_points": kernels.visibility.points, "hidden_pairs": kernels.visibility.hidden}
-    if isinstance(kernels, BasisRKPM) and kernels.detours is not None:
-        table = kernels.detours
-        found |= {"material_points": table.points, "material_frame": table.frame}
-        found |= {"detour_pairs": table.pairs, "detour_lengths": table.lengths}
-    return found
 
 
 def _scalar(value: Scalar | tuple[object, ...]) -> Scalar:

@@ -212,21 +212,21 @@ def _numbers_told(body: ReducedBody) -> dict[str, float]:
 def _check_geometry(body: ReducedBody, notes: _Notes) -> None:
     """Compare volume, hull and what the surface samples enclose by the divergence theorem; find thin bodies."""
     extent = np.ptp(body.bounds, axis=0)
-    area = float(body.surface_areas.sum())
+    area = float(body.surface.areas.sum())
     volume = notes.measure("volume", body.volume, "m^3")
     notes.measure("mass at 1000 kg/m^3", 1000.0 * volume, "kg")
     for axis, length in zip("xyz", extent, strict=True):
         notes.measure(f"extent {axis}", length, "m")
     notes.measure("surface area", area, "m^2")
     try:
-        hull = float(ConvexHull(body.surface_points).volume)
+        hull = float(ConvexHull(body.surface.points).volume)
     except QhullError:
         hull = 0.0
     box = float(np.prod(extent))
     notes.measure("volume over convex hull", volume / hull if hull > 0.0 else np.inf)
-    flux = float(body.surface_areas @ (body.surface_normals * body.surface_points).sum(axis=1)) / 3.0
+    flux = float(body.surface.areas @ (body.surface.normals * body.surface.points).sum(axis=1)) / 3.0
     enclosed = notes.measure("volume by surface samples over volume", flux / volume)
-    closure = float(np.linalg.norm(body.surface_areas @ body.surface_normals)) / area
+    closure = float(np.linalg.norm(body.surface.areas @ body.surface.normals)) / area
     notes.measure("mean normal of the surface", closure)
     # Samples lie inside the corners of their hull, so a box fills a little more than it: 1.08 with 80 samples.
     if volume > 1.05 * box or (hull > 0.0 and volume > 1.5 * hull):
@@ -245,9 +245,9 @@ def _check_geometry(body: ReducedBody, notes: _Notes) -> None:
             "close the asset's surface and turn all its faces outwards, or take more surface samples (--surface)",
         )
     _check_shape(body, notes)
-    spread = np.sqrt(np.linalg.eigvalsh(np.cov(body.surface_points.T)))
+    spread = np.sqrt(np.linalg.eigvalsh(np.cov(body.surface.points.T)))
     slender = notes.measure("slenderness", spread[0] / spread[-1])
-    points, kernels = body.provenance.get("quadrature_count"), len(body.centres)
+    points, kernels = body.provenance.get("quadrature_count"), len(body.kernels.centres)
     if isinstance(points, int) and kernels * KERNEL_POINTS > points:
         notes.find(
             "warning",
@@ -290,9 +290,9 @@ def _check_geometry(body: ReducedBody, notes: _Notes) -> None:
             f" {complete:.0f} would have all of it",
             f"build it with --functions {complete:.0f}",
         )
-    if error is not None or body.region_names:
+    if error is not None or body.regions.names:
         return
-    degrees = body.handle_degrees
+    degrees = body.handles.degrees
     tolerance = body.provenance.get("option_rank_tolerance")
     if slender < SLENDER and not (degrees == 2).any():
         notes.find(
@@ -315,10 +315,10 @@ def _check_geometry(body: ReducedBody, notes: _Notes) -> None:
 def _check_shape(body: ReducedBody, notes: _Notes) -> None:
     """Find bodies that are thin as a whole, and thin walls."""
     size = float(np.ptp(body.bounds, axis=0).max())
-    thickness = notes.measure("mean thickness over size", 2.0 * body.volume / body.surface_areas.sum() / size)
+    thickness = notes.measure("mean thickness over size", 2.0 * body.volume / body.surface.areas.sum() / size)
     voxel = _numbers_told(body).get("quadrature_voxel", 0.0)
     limit = max(WALL * size, WALL_VOXELS * voxel)
-    share = float(body.surface_areas[_wall_thickness(body) < limit].sum() / body.surface_areas.sum())
+    share = float(body.surface.areas[_wall_thickness(body) < limit].sum() / body.surface.areas.sum())
     notes.measure("surface that bounds thin walls", share)
     if thickness < 0.005:
         notes.find(
@@ -345,8 +345,8 @@ def _wall_thickness(body: ReducedBody) -> Array:
     within a spacing of samples beside it; the nearest cut counts. Behind the planes of an inner wall that curves away
     the surface is deeper, by 1/2 dn . d where the normal changes by dn over the distance d.
     """
-    points, normals = body.surface_points.astype(np.float64), body.surface_normals.astype(np.float64)
-    pitch2 = body.surface_areas.sum() / body.surface_count
+    points, normals = body.surface.points.astype(np.float64), body.surface.normals.astype(np.float64)
+    pitch2 = body.surface.areas.sum() / body.surface_count
     found = np.empty(len(points))
     for part in np.array_split(np.arange(len(points)), max(1, len(points) // 256)):
         way = points[None] - points[part, None]
@@ -365,12 +365,12 @@ def _check_tables(body: ReducedBody, notes: _Notes) -> None:
     """Compare the stored tables with the functions that the body evaluates, and with affine motion."""
     moment = body.mean_basis @ body.linear_coordinates
     off = float(np.abs(moment[:3]).max()) / body.length + abs(float(moment[3]) - 1.0)
-    linear = np.column_stack([body.surface_points, np.ones(body.surface_count)])
-    reproduced = np.abs(body.surface_basis.astype(np.float64) @ body.linear_coordinates - linear)
+    linear = np.column_stack([body.surface.points, np.ones(body.surface_count)])
+    reproduced = np.abs(body.surface.basis.astype(np.float64) @ body.linear_coordinates - linear)
     affine = notes.measure("error of affine motion", float((reproduced / [*[body.length] * 3, 1.0]).max()))
-    gradient = body.evaluate(body.points)[1]
-    slope = np.abs(gradient - body.grad_basis).max() / max(np.abs(gradient).max(), 1e-300)
-    value = np.abs(body.evaluate(body.surface_points)[0] - body.surface_basis).max()
+    gradient = body.evaluate(body.cubature.points)[1]
+    slope = np.abs(gradient - body.cubature.grad_basis).max() / max(np.abs(gradient).max(), 1e-300)
+    value = np.abs(body.evaluate(body.surface.points)[0] - body.surface.basis).max()
     stored = notes.measure("error of stored tables", max(float(slope), float(value)))
     if not (affine < 1e-4 and stored < 1e-4 and off < 1e-6):
         notes.find(
@@ -380,7 +380,7 @@ def _check_tables(body: ReducedBody, notes: _Notes) -> None:
             f" {stored:.1e}, the centre of mass by {off:.1e} (rounding: 1e-6)",
             "build the body again; the file was changed or mixed up",
         )
-    notes.measure("cubature volume over volume", float(body.weights.sum() / body.volume))
+    notes.measure("cubature volume over volume", float(body.cubature.weights.sum() / body.volume))
 
 
 def _check_parts(body: ReducedBody, interior: Interior, notes: _Notes) -> None:
@@ -399,7 +399,7 @@ def _check_parts(body: ReducedBody, interior: Interior, notes: _Notes) -> None:
             "keep one part (--crop, or for splats --part), or build one body for each",
         )
     first = float(body.eigenvalues[1:].min(initial=np.inf)) * body.length**2
-    if first < 1e-6 and not body.region_names:
+    if first < 1e-6 and not body.regions.names:
         notes.find(
             "broken",
             "loose parts",
@@ -411,7 +411,7 @@ def _check_parts(body: ReducedBody, interior: Interior, notes: _Notes) -> None:
 def _check_functions(body: ReducedBody, interior: Interior, notes: _Notes) -> None:
     """Measure coverage, conditioning, mass, stiffness and Jacobians over the interior."""
     covered = notes.measure("interior within reach of kernels", float(body.covers(interior.points).mean()))
-    touched = notes.measure("surface within reach of kernels", float(body.covers(body.surface_points).mean()))
+    touched = notes.measure("surface within reach of kernels", float(body.covers(body.surface.points).mean()))
     if covered < 0.99 or touched < 0.99:
         notes.find(
             "warning",
@@ -420,8 +420,8 @@ def _check_functions(body: ReducedBody, interior: Interior, notes: _Notes) -> No
             " them the functions are continued as constants",
             "take more kernels (--kernels)",
         )
-    inside = np.concatenate([interior.points[body.covers(interior.points)], body.points])
-    worst = float(body.kernels.conditions(inside).max()) if body.skinned else 1.0
+    inside = np.concatenate([interior.points[body.covers(interior.points)], body.cubature.points])
+    worst = float(body.reproducing_kernels.conditions(inside).max()) if body.skinned else 1.0
     condition = notes.measure("worst condition of a moment matrix", worst)
     if not condition < CONDITION_WARNING:
         notes.find(
@@ -437,7 +437,7 @@ def _check_functions(body: ReducedBody, interior: Interior, notes: _Notes) -> No
         mass = float(np.linalg.norm(gram - np.eye(len(gram)))) / np.sqrt(len(gram))
         notes.measure("error of orthonormality in mass", mass)
         # Cells that the face of a region cuts were refined at build time: 0.02 is what that is worth.
-        limit = 0.35 if not interior.exact else 0.1 if body.region_names else 1e-6
+        limit = 0.35 if not interior.exact else 0.1 if body.regions.names else 1e-6
         if not mass < limit:
             notes.find(
                 "broken",
@@ -452,8 +452,8 @@ def _check_functions(body: ReducedBody, interior: Interior, notes: _Notes) -> No
 def _check_stiffness(body: ReducedBody, interior: Interior, gradient: Array, notes: _Notes) -> None:
     """Compare the cubature's stiffness with that of the interior; look for motions without energy and inversions."""
     free = slice(body.driven_count, None)
-    few = body.grad_basis.astype(np.float64)[:, free].transpose(1, 2, 0)
-    modulus = body.weights * body.stiffness_scale
+    few = body.cubature.grad_basis.astype(np.float64)[:, free].transpose(1, 2, 0)
+    modulus = body.cubature.weights * body.cubature.stiffness_scale
     chosen = np.linalg.eigvalsh(reduced_stiffness(few, modulus, POISSON_RATIO))
     rigid = 0 if body.driven_count else 6
     gradient = gradient[:, free]
@@ -505,7 +505,7 @@ def _check_stiffness(body: ReducedBody, interior: Interior, gradient: Array, not
 def _check_build(body: ReducedBody, notes: _Notes) -> None:
     """Read what the build has measured and left out."""
     told = _numbers_told(body)
-    held = bool(body.region_names)
+    held = bool(body.regions.names)
     notes.measure("functions", body.function_count)
     notes.measure("cubature points", body.point_count)
     force = told.get("cubature_force_error")
@@ -646,10 +646,10 @@ def _check_splats(body: ReducedBody, splats: Array, notes: _Notes) -> None:
     from softmode.deformables.quadrature.interior import winding_numbers
 
     size = float(np.linalg.norm(np.ptp(body.bounds, axis=0)))
-    pitch = float(np.sqrt(body.surface_areas.sum() / body.surface_count))
-    near = KDTree(body.surface_points).query(splats)[0]
+    pitch = float(np.sqrt(body.surface.areas.sum() / body.surface_count))
+    near = KDTree(body.surface.points).query(splats)[0]
     far = near > max(2.0 * pitch, 0.02 * size)
-    far[far] = winding_numbers(body, splats[far]) < 0.5
+    far[far] = winding_numbers(splats[far], body.surface.points, body.surface.normals, body.surface.areas) < 0.5
     notes.measure("splats", len(splats))
     loose = notes.measure("splats away from the body", float(far.mean()))
     if far.any():
@@ -663,8 +663,8 @@ def _check_splats(body: ReducedBody, splats: Array, notes: _Notes) -> None:
     # The sixth neighbour of a splat is one and a half spacings away.
     tree = KDTree(splats)
     spacing = float(np.median(tree.query(splats, k=min(7, len(splats)))[0][:, -1])) / 1.5
-    bare = tree.query(body.surface_points)[0] > BARE * spacing
-    share = notes.measure("surface without splats", float(body.surface_areas[bare].sum() / body.surface_areas.sum()))
+    bare = tree.query(body.surface.points)[0] > BARE * spacing
+    share = notes.measure("surface without splats", float(body.surface.areas[bare].sum() / body.surface.areas.sum()))
     if share > 0.05:
         notes.find(
             "warning",

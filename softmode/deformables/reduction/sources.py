@@ -94,10 +94,10 @@ def mass_points(body: ReducedBody) -> tuple[Array, Array]:
     They are those of the build where the body keeps its sources, else the cubature's, with volumes for masses.
     """
     if not body.sources:
-        return body.points, body.weights
+        return body.cubature.points, body.cubature.weights
     given = unpack_sources(body)
     pieces = pieces_near(given.quadrature, given.regions)
-    points, volumes, parent = refine_at_faces(body.regions, pieces, body.offset)
+    points, volumes, parent = refine_at_faces(body.regions.parts, pieces, body.offset)
     return points, volumes if given.density_scale is None else volumes * given.density_scale[pieces.parent[parent]]
 
 

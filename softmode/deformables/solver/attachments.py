@@ -99,7 +99,7 @@ def attach(
         pins = s * pins  # kappa of the larger region is less by s^2, its volume more by s^3
     elif points is not None:
         X = np.asarray(points, float).reshape(-1, 3) / s
-        pins = np.full(len(X), s * s * per_area * body.surface_areas.sum() / max(len(X), 1))
+        pins = np.full(len(X), s * s * per_area * body.surface.areas.sum() / max(len(X), 1))
         outside = X[~np.isfinite(X).all(axis=1)] if not np.isfinite(X).all() else X[~body.holds(X)]
         if len(outside):
             raise ConfigError(
@@ -109,10 +109,10 @@ def attach(
     else:
         assert box is not None
         lower, upper = np.asarray(box[0], float) / s, np.asarray(box[1], float) / s
-        inside = ((body.surface_points >= lower) & (body.surface_points <= upper)).all(axis=1)
-        X, pins = body.surface_points[inside], s * s * per_area * body.surface_areas[inside]
+        inside = ((body.surface.points >= lower) & (body.surface.points <= upper)).all(axis=1)
+        X, pins = body.surface.points[inside], s * s * per_area * body.surface.areas[inside]
     if len(X) == 0:
-        low, high = s * body.surface_points.min(axis=0), s * body.surface_points.max(axis=0)
+        low, high = s * body.surface.points.min(axis=0), s * body.surface.points.max(axis=0)
         raise ConfigError(
             f"the attachment of body {body.name!r} holds no point", hint=f"its surface spans {low} to {high} [m]"
         )
@@ -132,14 +132,14 @@ def _region_pins(body: ReducedBody, name: str, youngs_modulus: float) -> tuple[n
     Raises:
         ConfigError: If the region is unknown or exact.
     """
-    if name not in body.region_names:
-        raise ConfigError(f"body {body.name!r} has no region {name!r}", hint=f"it has {list(body.region_names)}")
-    stiffness = float(body.region_stiffness[body.region_names.index(name)])
+    if name not in body.regions.names:
+        raise ConfigError(f"body {body.name!r} has no region {name!r}", hint=f"it has {list(body.regions.names)}")
+    stiffness = float(body.regions.stiffness[body.regions.names.index(name)])
     if stiffness == 0.0:
         raise ConfigError(f"region {name!r} is held exactly and needs no pins", hint="move it with drive_regions")
-    rows = body.region_rows(name)
-    rows = rows[body.region_weights[rows] > 0.0]
-    return body.region_points[rows], stiffness * youngs_modulus * body.region_weights[rows]
+    rows = body.regions.rows(name)
+    rows = rows[body.regions.weights[rows] > 0.0]
+    return body.regions.points[rows], stiffness * youngs_modulus * body.regions.weights[rows]
 
 
 def _coordinates(builder: newton.ModelBuilder, instance: int, body: ReducedBody) -> np.ndarray:
@@ -185,10 +185,10 @@ def untold_share(body: ReducedBody, points: np.ndarray, reach: float = 0.0) -> f
         points: Held points of its rest frame [m], shape (N, 3).
         reach: How far a point holds what is around it [m], at least the distance between samples of the surface.
     """
-    spacing = float(np.sqrt(body.surface_areas.mean()))
-    for region in body.regions:
+    spacing = float(np.sqrt(body.surface.areas.mean()))
+    for region in body.regions.parts:
         points = points[region.distance(points)[0] > spacing]
     if not len(points):
         return 0.0
-    apart = KDTree(points).query(body.surface_points)[0]
-    return float(body.surface_areas[apart <= max(spacing, reach)].sum() / body.surface_areas.sum())
+    apart = KDTree(points).query(body.surface.points)[0]
+    return float(body.surface.areas[apart <= max(spacing, reach)].sum() / body.surface.areas.sum())

@@ -128,7 +128,7 @@ class SurfacePressure:
         assets = layout.asset[layout.instance_start[:-1] + soft]
         if np.ptp(assets):
             raise ConfigError(f"soft body {soft} is not the same in every world", hint="replicate one builder")
-        self.area = layout.bodies[assets[0]].surface_areas.copy()
+        self.area = layout.bodies[assets[0]].surface.areas.copy()
         shape = (worlds, len(self.area))
         self._normal_force, self._friction = (wp.zeros(shape, dtype=wp.vec3d, device=device) for _ in range(2))
         self._surface_normal = None if view.pairs is None else view.pairs.surface_normal

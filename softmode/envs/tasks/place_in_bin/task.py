@@ -197,8 +197,8 @@ class PlaceInBin(Task):
         self.highest = given.height + self.config.rim_allowance
         """Height of its centre below which an object is in the bin [m]."""
         held = self.scene.occupancy
-        toys = [thing.body.surface_points for thing in held.choices]
-        others = [thing.body.surface_points for thing in held.others]
+        toys = [thing.body.surface.points for thing in held.choices]
+        others = [thing.body.surface.points for thing in held.others]
         self.wall, self.floor, self.margin, self.clearance = given.wall, given.floor, 0.3 * min(self.half), CLEARANCE
         radius = [[thing.radius] * held.slots for thing in held.choices]
         self.radius = held.follow(radius, every_slot=held.slots > 1)

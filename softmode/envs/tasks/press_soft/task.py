@@ -138,7 +138,7 @@ class PressSoft(Task):
     @property
     def _tops(self) -> NDArray[np.float64]:
         """Height of every unscaled pad that a world may have [m], shape (choices,)."""
-        return np.array([float(np.ptp(thing.body.surface_points[:, 2])) for thing in self.scene.occupancy.choices])
+        return np.array([float(np.ptp(thing.body.surface.points[:, 2])) for thing in self.scene.occupancy.choices])
 
     @property
     def tops(self) -> NDArray[np.float64]:

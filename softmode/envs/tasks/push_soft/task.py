@@ -118,7 +118,7 @@ class PushSoft(Task):
     def build(self) -> None:
         """Allocate what the reward remembers."""
         self.before = wp.zeros(self.world_count, dtype=float, device=self.device)
-        surfaces = [thing.body.surface_points for thing in self.scene.occupancy.choices]
+        surfaces = [thing.body.surface.points for thing in self.scene.occupancy.choices]
         rest = [surface[points] for surface, points in zip(surfaces, self.points_of_choices, strict=True)]
         self.rest = self.scene.occupancy.follow(np.stack(rest), wp.vec3)
         self.yaw_tolerance = -1.0 if self.config.yaw_tolerance is None else self.config.yaw_tolerance
@@ -184,7 +184,7 @@ class PushSoft(Task):
 
 def _outline(thing: SoftObject) -> Splats:
     """Return dots along the outline of an object, seen from above."""
-    points = thing.body.surface_points[:, :2]
+    points = thing.body.surface.points[:, :2]
     corners = points[ConvexHull(points).vertices]
     edges = np.roll(corners, -1, axis=0) - corners
     length = np.linalg.norm(edges, axis=1)

@@ -183,8 +183,8 @@ class RopeRoute(Task):
             ConfigError: If a body is no rope; it names the object.
         """
         for name, body in zip(self.scene.occupancy.names, bodies, strict=True):
-            length = float(np.ptp(body.surface_points[:, 0]))
-            width = 2.0 * float(np.linalg.norm(body.surface_points[:, 1:], axis=1).max())
+            length = float(np.ptp(body.surface.points[:, 0]))
+            width = 2.0 * float(np.linalg.norm(body.surface.points[:, 1:], axis=1).max())
             if length < SLENDER * width:
                 raise ConfigError(
                     f"{name} is no rope: {length:.3f} m along x, and {width:.3f} m across",

@@ -38,7 +38,7 @@ class ScriptedShape(ScriptedPolicy):
     def _ends(self) -> list[NDArray[np.bool_]]:
         """Return which points are at the free end, of the target and of the post."""
         task, row = self.task, self.scene.occupancy.rows[self.world]
-        bent = self.soft.body.surface_points[task.points_of_choices[row]]
+        bent = self.soft.body.surface.points[task.points_of_choices[row]]
         return [rest[:, 2] > rest[:, 2].max() - 0.02 for rest in (task.goal_rests[row], bent)]
 
     def __call__(self, observation: object = None) -> NDArray[np.float32]:

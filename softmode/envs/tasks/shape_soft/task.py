@@ -55,12 +55,12 @@ class ShapeSoft(Task):
         scene = self.scene
         choices = range(len(scene.occupancy.choices))
         presses = [self._record(c) for c in choices]
-        rests = [body.surface_points[chosen] for body, _, chosen in presses]
+        rests = [body.surface.points[chosen] for body, _, chosen in presses]
         self.goal_rests = tuple(rests)
         """Rest points of the targets in the frame of their body [m], one of shape (points, 3) per choice."""
         if scene.splats is not None:  # the marker shows the whole surface
             rests = [
-                np.concatenate([rest, body.surface_points]) for rest, (body, *_) in zip(rests, presses, strict=True)
+                np.concatenate([rest, body.surface.points]) for rest, (body, *_) in zip(rests, presses, strict=True)
             ]
             shape = (self.world_count, scene.marker_points.shape[1])
             scene.marker_points = wp.zeros(shape, dtype=wp.vec3, device=self.device)
@@ -87,7 +87,7 @@ class ShapeSoft(Task):
         body = scene.soft.body
         points = self.points_of_choices[choice]
         if goal is not None:
-            points = sample_farthest(body.surface_points, POINTS, first=0)
+            points = sample_farthest(body.surface.points, POINTS, first=0)
         try:
             return body, record_press(scene, self.config.goal_displacement[1]), points
         except ConfigError as error:
@@ -127,7 +127,7 @@ class ShapeSoft(Task):
 
 def _surface(thing: SoftObject) -> Splats:
     """Return dots on the surface of an object."""
-    return dots(thing.body.surface_points, 0.004, opacity=0.35)
+    return dots(thing.body.surface.points, 0.004, opacity=0.35)
 
 
 class ShapeSoftEnv(ShapeGoals, SoftEnv[ShapeSoft]):
