@@ -260,7 +260,9 @@ def test_regions_resist_each_other_as_finite_elements_say(gap: float, expected: 
     n, r = body.function_count, body.driven_count
     driven = np.zeros((2, 3, n))
     for axis, motion in zip((0, 2), driven, strict=True):
-        motion[:, :r] = body.regions.driven_affine(np.stack([np.eye(3)] * 2), np.stack([np.zeros(3), np.eye(3)[axis]])).T
+        motion[:, :r] = body.regions.driven_affine(
+            np.stack([np.eye(3)] * 2), np.stack([np.zeros(3), np.eye(3)[axis]])
+        ).T
     K, motions = stiffness(body, 0.3), driven.reshape(2, -1)
     free = np.tile(np.arange(n) >= r, 3)
     answer = -np.linalg.solve(K[np.ix_(free, free)], K[free] @ motions.T)
