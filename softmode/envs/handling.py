@@ -42,7 +42,8 @@ class Handling:
     def __init__(self, scene: TableScene, friction: int, strain_limit: float, force_limit: float | None) -> None:
         """Allocate the figures and watch the scene."""
         worlds, device = scene.world_count, scene.device
-        self._scene = scene
+        self._device, self._worlds = device, worlds
+        self._read = (scene.solver.tables.instances, scene.model.gravity)
         try:
             pads = ParallelJaw.of(scene.config.arm).friction
         except ConfigError:  # a robot without a gripper holds nothing
@@ -57,15 +58,15 @@ class Handling:
         self.held_slot, self.falling_slot = (wp.full(worlds, -1, dtype=int, device=device) for _ in range(2))
         self.grip = wp.zeros(worlds, dtype=wp.vec3, device=device)
         self._kept = filled(kernels.Handling, self)
-        scene.after_substep = self.watch
+        scene.after_substep = self.watch  # which keeps no scene: environments are freed by counting references
 
     def state_arrays(self) -> dict[str, wp.array]:
         """Return what an episode goes on from."""
         return {f"handling.{name}": getattr(self, name) for name in kernels.Handling.vars}
 
-    def watch(self, substep: int) -> None:
-        """Raise the peaks after a substep."""
-        scene, tables = self._scene, self._scene.solver.tables
+    def watch(self, scene: TableScene, substep: int) -> None:
+        """Raise the peaks after a substep of the scene."""
+        tables = scene.solver.tables
         fingers = (scene.model.body_world_start, tables.body_wrench, scene.finger_body)
         given = (int(substep == 0), *fingers, self.step_force, self.step_strain)
         launch(scene.device, kernels.watch_forces, scene.world_count, *given)
@@ -82,10 +83,9 @@ class Handling:
             state: `WorldState`.
             result: `StepResult`.
         """
-        scene = self._scene
-        given = (fresh, *self._limits, state, result, scene.solver.tables.instances, scene.model.gravity, self._kept)
-        launch(scene.device, kernels.judge, scene.world_count, *given)
+        given = (fresh, *self._limits, state, result, *self._read, self._kept)
+        launch(self._device, kernels.judge, self._worlds, *given)
 
     def forget(self, world_mask: wp.array) -> None:
         """Begin the episodes of the masked worlds."""
-        launch(self._scene.device, kernels.forget_handling, self._scene.world_count, world_mask, self._kept)
+        launch(self._device, kernels.forget_handling, self._worlds, world_mask, self._kept)

@@ -174,5 +174,7 @@ def forget_handling(world_mask: wp.array[wp.bool], handling: Handling):
         for k in range(handling.handled.shape[1]):
             handling.handled[w, k] = 0.0
         handling.safe[w] = False
+        handling.step_force[w] = 0.0
+        handling.step_strain[w] = 0.0
         handling.held_slot[w] = -1
         handling.falling_slot[w] = -1

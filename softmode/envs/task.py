@@ -219,7 +219,7 @@ class Task:
             self.film = TaskFilm(self)
             self.build()
             self.plan = None if self.step_kernels is None else plan_of(self, self.step_kernels[0])
-            watch = partial(self.handling.watch, scene.config.substeps - 1)
+            watch = partial(self.handling.watch, scene, scene.config.substeps - 1)
             judge = partial(self.judge, self.episodes.never)
             for launches in (self.before_step, watch, judge, self.clear):
                 compile_launches(launches, self.device)

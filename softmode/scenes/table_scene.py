@@ -140,8 +140,8 @@ class TableScene:
         self.world_count = world_count
         self.device = wp.get_device(device)
         self.dt = 1.0 / (config.control_hz * config.substeps)
-        self.after_substep: Callable[[int], None] | None = None
-        """Launches after each substep, whose number it is given."""
+        self.after_substep: Callable[[TableScene, int], None] | None = None
+        """Launches after each substep; is given the scene and the number of the substep."""
         given = config.objects
         if given is not None and given.resample and (config.others or config.grip_slots):
             what = "others" if config.others else "grip_slots"
@@ -419,7 +419,7 @@ class TableScene:
                 grips.apply(first, self.control, self.dt)
             self.solver.step(first, second, self.control, None, self.dt)
             if self.after_substep is not None:
-                self.after_substep(substep)
+                self.after_substep(self, substep)
         self.observe()
 
     def observe(self) -> None:

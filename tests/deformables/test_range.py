@@ -89,7 +89,7 @@ def test_potential_of_the_twin(hold):
     )
     rng = np.random.default_rng(0)
     q, start, velocity, direction = rng.normal(size=(4, bar.body.function_count, 3)) * 1e-3
-    step = 1e-3
+    step = 3e-4
     ends = [potential(twin, q + sign * step * direction, start, velocity) for sign in (1.0, -1.0)]
     slope = float((twin.residual(q, start, velocity) * direction).sum())
     assert (ends[0] - ends[1]) / (2 * step) == pytest.approx(slope, rel=1e-5)
