@@ -46,7 +46,7 @@ def transported(points: Array, mass: Array, target: Array, grid: Grid) -> Array:
     box = tuple(slice(begin, end) for begin, end in zip(low, high, strict=True))
     a, b = (m[box].astype(np.float64) / m.sum(dtype=np.float64) for m in (mass, target))
     least = (float((high - low).max()) / FARTHEST) ** 2
-    log_v, last = np.zeros(b.shape), 1.0
+    log_v, last, v, kernel = np.zeros(b.shape), 1.0, b, [b]
     for stage, count in STAGES:
         entropy = max(stage, least)
         kernel = [np.exp(-(np.subtract.outer(k, k) ** 2) / entropy) for k in map(np.arange, a.shape)]

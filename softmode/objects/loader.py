@@ -149,7 +149,7 @@ def object_config(source: Source | str | os.PathLike[str] | None, **options: Any
         if os.fspath(source) in PRESETS:
             return ObjectConfig(preset=os.fspath(source), **options)
         if bundled(source):
-            return ObjectConfig(splat=source, **options)
+            return ObjectConfig(splat=os.fspath(source), **options)
         kind = file_kind(source)
         return ObjectConfig(**{"splat" if kind == "points" else kind: Path(source)}, **options)
     for known, kind in _IN_MEMORY.items():
