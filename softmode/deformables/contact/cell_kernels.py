@@ -189,7 +189,7 @@ def neighbour_at(shape: CellShape, fade: wp.float64, gap: wp.float64):
 
 
 @wp.func
-def touched_share(
+def spared_share(
     surface: Surface,
     found: wp.array3d[int],  # (instance_count, sample_max, SLOTS), what is touched
     gap: wp.array3d[wp.float64],  # likewise [m]
@@ -199,14 +199,14 @@ def touched_share(
     row: int,
     other: int,
 ):
-    """Return c, the share of a sample's neighbourhood that touches the same thing at the start of the step."""
-    carried = wp.float64(0.0)
+    """Return the share of a sample's neighbourhood that does not touch the same thing at the start of the step."""
+    spared = wp.float64(1.0)
     for k in range(surface.start[row], surface.start[row + 1]):
         t = surface.neighbour[k]
         for slot in range(SLOTS):
             if found[i, t, slot] == other:
-                carried += wp.float64(surface.weight[k]) * touching(neighbour_at(shape, fade, gap[i, t, slot]))
-    return carried
+                spared -= wp.float64(surface.weight[k]) * touching(neighbour_at(shape, fade, gap[i, t, slot]))
+    return wp.max(spared, wp.float64(0.0))
 
 
 @wp.func

@@ -3,10 +3,10 @@
 n functions in a volume V resolve patches of the size h = (V / n)^(1/3). What a narrower patch would press in beyond
 their motion is, per pressure,
 
-    w = 0.30 h (1 - nu^2) / E (1 - c^2),
+    w = 0.39 h (1 - nu^2) / E (1 - c),
 
-a bed of springs (Winkler) of the scale that is missing, in series with the penalty of contact, less with the share c of
-the neighbourhood that touches: what presses on a whole face, the functions carry. It was fitted to pairs
+a bed of springs (Winkler) of the scale that is missing, in series with the penalty of contact, times the share of the
+neighbourhood that is not touched: what presses on a whole face, the functions carry. It was fitted to pairs
 of opposite discs on cubes, beams, pads and spheres of 28 to 68 functions against 2,000 kernels. A wall is no
 softer than itself: h is bounded by a share of its thickness.
 
@@ -32,15 +32,15 @@ from softmode.deformables.model.tables import allocate
 
 Array = NDArray[np.float64]
 
-DENT_FACTOR = 0.30
+DENT_FACTOR = 0.39
 """Dent over the size of what the functions resolve, under the pressure E / (1 - nu^2), where nothing around is touched.
 """
 WALL_SHARE = 0.6
 """Bound of that size as a share of the thickness below a sample."""
 COVER = 1.6
 """Radius over the resolved size of the neighbourhood whose touched share a dent is less by. A wall does not cut it."""
-CARRIED = 0.99
-"""c where all of the neighbourhood touches. What is left of the dent softens a squeeze by 1 %
+CARRIED = 0.98
+"""Share of the dent that functions carry where all of the neighbourhood touches. What is left softens a squeeze by 1 %
 at most; without it, a dent that comes and goes with gaps of micrometres costs a grasp iterations."""
 THIN = 3.0
 """Thicknesses below which a body is thin: contact then sinks in by a share of them, not of its size."""

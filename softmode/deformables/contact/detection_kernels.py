@@ -19,7 +19,7 @@ from softmode.deformables.contact.cell_kernels import (
     gradient_of,
     shape_curvature,
     shape_of_cell,
-    touched_share,
+    spared_share,
     write_row,
 )
 from softmode.deformables.contact.penalty_kernels import (
@@ -568,8 +568,7 @@ def gather_contacts(
             ahead, closing = ahead_of(instances, basis, motion, start, normal, i, row, dt)
             closing -= wp.dot(normal, wp.vec3d(shape_drift(shapes, shape, wp.vec3(samples.position[i, s]), dt)))
             fade = fade_of(cell_shape, ahead, normal)
-            touched = touched_share(surface, samples.shape, samples.gap, cell_shape, fade, i, row, shape)
-            spared = float(wp.float64(1.0) - touched * touched)
+            spared = float(spared_share(surface, samples.shape, samples.gap, cell_shape, fade, i, row, shape))
         area = wp.max(sample_area(instances.scale[i], basis.row_area[row]), 1.0e-30)
         relative = surface.relative_stiffness[row]
         partner_mass = float(0.0)

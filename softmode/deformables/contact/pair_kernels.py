@@ -31,7 +31,7 @@ from softmode.deformables.contact.cell_kernels import (
     fade_of,
     gradient_of,
     shape_of_cell,
-    touched_share,
+    spared_share,
 )
 from softmode.deformables.contact.detection_kernels import rank_contacts
 from softmode.deformables.contact.penalty_kernels import (
@@ -547,8 +547,8 @@ def write_pairs(
     F_own = gradient_of(instances, basis, motion.q_start, i, own)
     fade = fade_of(mine, F_own, n)
     theirs = shape_of_cell(surface, instances, basis, j, at, surface.curvature[own] / instances.scale[i])
-    spared_i = float(wp.float64(1.0) - touched_share(surface, pairs.other, pairs.gap, mine, fade, i, own, j))
-    spared_j = float(wp.float64(1.0) - touched_share(surface, pairs.other, pairs.gap, theirs, fade, j, at, i))
+    spared_i = float(spared_share(surface, pairs.other, pairs.gap, mine, fade, i, own, j))
+    spared_j = float(spared_share(surface, pairs.other, pairs.gap, theirs, fade, j, at, i))
     wi = wp.float64(spared_i * dent_compliance(instances, i, ri, surface.dent_length[own]) / half_area)
     wj = wp.float64(spared_j * dent_compliance(instances, j, rj, surface.dent_length[at]) / half_area)
     compliance = wi + wj

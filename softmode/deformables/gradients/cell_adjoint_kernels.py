@@ -22,7 +22,7 @@ from softmode.deformables.contact.cell_kernels import (
     gradient_of,
     neighbour_at,
     shape_of_cell,
-    touched_share,
+    spared_share,
     write_row,
 )
 from softmode.deformables.contact.detection_kernels import Shapes, curvature_of, shape_area, shape_drift
@@ -166,8 +166,7 @@ def accumulate_cells(
     fade = fade_of(cell_shape, ahead, n)
     spared = zero  # or one, far away: either does not change
     if gap <= NEAR * cell_shape.steepest:
-        touched = touched_share(surface, samples.shape, samples.gap, cell_shape, fade, i, row, shape)
-        spared = wp.float64(1.0) - touched * touched
+        spared = spared_share(surface, samples.shape, samples.gap, cell_shape, fade, i, row, shape)
     by_gap = zero
     by_fade = zero
     for m in range(surface.start[row], surface.start[row + 1]):
@@ -184,19 +183,18 @@ def accumulate_cells(
     if spared > zero:
         own = depth_bar + force_bar * steep * HARDENING_DEPTH * cell_shape.least  # less the part that no dent shifts
         spared_bar = (step.normal_bar[i, e][1] + own + by_log) / spared
-        spared_bar *= wp.float64(2.0) * wp.sqrt(wp.max(wp.float64(1.0) - spared, zero))  # by -c
     step.cell_spared[i, e] = spared_bar
     fade_bar = spared_bar * by_fade
     step.cell_gradient[i, e] = by_F + fade_bar * fade_F + along * wp.outer(n, cell.centre)
     step.cell_place[i, e] = by_place * n
 
     # lengths grow with the scale, but not the radius of what is touched
-    above = half * spared_bar * by_gap
-    bend_bar = by_shape.bend + fade_bar * fade_shape.bend + above
+    touched = half * spared_bar * by_gap
+    bend_bar = by_shape.bend + fade_bar * fade_shape.bend + touched
     area = wp.float64(instances.scale[i] * instances.scale[i] * basis.row_area[row])
     by_scale = depth_bar + fade_bar * fade_shape.fade * cell_shape.fade
     by_scale += (by_shape.steepest + fade_bar * fade_shape.steepest) * cell_shape.steepest
-    by_scale += (by_shape.least - above) * cell_shape.least
+    by_scale += (by_shape.least - touched) * cell_shape.least
     if cell_shape.bend > zero:
         by_scale += bend_bar * (cell_shape.bend + area * wp.float64(other) / (wp.float64(2.0) * PI))
     firm = surface.relative_stiffness[row] * surface.slenderness[row]
