@@ -259,21 +259,17 @@ def test_fast_impact_stays_shallow(youngs_modulus, density):
 
 @pytest.mark.parametrize("ratio", [0.001, 1000.0])
 def test_fast_impact_of_light_and_heavy_boxes(ratio):
-    """A free box of 0.001 and 1000 times the mass hits a soft cube at 5 m/s: 1 % of the edge deep besides the dent.
-
-    Depths are those at the starts of steps: the light box is turned back in the first, by the outer half of the onset.
-    """
+    """A free box of 0.001 and 1000 times the mass hits a soft cube at 5 m/s: 1 % of the edge deep besides the dent."""
     scene, twin = impact(ratio, speed=5.0, dt=0.001)
     momentum, _, energy = totals(scene, twin)
-    depth, pressed = [], False
+    depth = []
     for _ in range(60):
         scene.step()
-        pressed = pressed or bool(scene.reduced.instance_force.numpy().any())
         depth.append(-float(scene.reduced.view.samples.gap.numpy()[0, :, 0].min()))
         p, _, e = totals(scene, twin)
         assert np.abs(p - momentum).max() <= 1e-5 * np.abs(momentum).max()
         assert e <= (1.0 + 1e-6) * energy
-    assert pressed and max(depth) <= 0.01 * EDGE + dent_bound(scene)
+    assert np.abs(p - momentum).max() < abs(e - energy) and max(depth) <= 0.01 * EDGE + dent_bound(scene)
 
 
 # -- friction ----------------------------------------------------------------------------------------------------------

@@ -3,14 +3,13 @@
 The surface of a body is what its samples x_k with deformed normals n_k say: near a point x the implicit moving
 least-squares surface (Kolluri 2008, doi:10.1145/1361192.1361195, eq. 1)
 
-    gap(x) = sum_k theta_k (n_k . (x - x_k) + H_k d_k^2 / 2) / sum_k theta_k,
+    gap(x) = sum_k theta_k n_k . (x - x_k) / sum_k theta_k,
     theta_k = exp(-(|x - x_k|^2 - d_min^2) / h^2) max(-n . n_k - c, 0)^2,
 
-h three quarters of the spacing of the samples, n the normal of the sample at x, c = 0.3, d_k the distance across n_k
-and H_k the mean curvature at rest, by which the surface falls off its tangent planes: else a coarse ball reaches 0.6 mm
-too far. It is exact for a plane, to second order for a sphere, has none of the bumps of a ball around every sample, and
-is blind to what lies around a sharp edge. Samples of each body are tested against the surfaces of the others. What is
-touched of the other body is the material at x, less the gap n that has to close before,
+h three quarters of the spacing of the samples, n the normal of the sample at x, c = 0.3: exact for a plane, without the
+bumps that a ball around every sample would have, and blind to what lies around a sharp edge. Samples of each body are
+tested against the surfaces of the others. What is touched of the other body is the material at x, less the gap n that
+has to close before,
 
     sum_k theta_k b(X_k) / sum_k theta_k + grad b(X_t) . F_t^-1 (x - max(gap, 0) n - sum_k theta_k x_k / sum_k theta_k),
 
@@ -254,17 +253,7 @@ def beside(samples: Samples, pairs: Pairs, x: wp.vec3d, j: int, row: int, centre
 
 
 @wp.func
-def fit_patch(
-    instances: Instances,
-    basis: Basis,
-    samples: Samples,
-    curvature: wp.array[float],
-    pairs: Pairs,
-    i: int,
-    s: int,
-    j: int,
-    t: int,
-):
+def fit_patch(instances: Instances, basis: Basis, samples: Samples, pairs: Pairs, i: int, s: int, j: int, t: int):
     """Fit the surface of instance j near sample s of instance i; t is its nearest sample, as ``find_pairs`` says."""
     patch = Patch()
     x = samples.position[i, s]
@@ -278,10 +267,8 @@ def fit_patch(
             away = x - samples.position[j, u]
             theta = weigh(samples, pairs, i, s, j, u, t)
             n = wp.vec3d(pairs.surface_normal[j, u])
-            height = wp.dot(n, away)
-            bend = 0.5 * curvature[instances.row_start[j] + u] / instances.scale[j]
             patch.total += theta
-            patch.gap += theta * (height + wp.float64(bend) * (wp.length_sq(away) - height * height))
+            patch.gap += theta * wp.dot(n, away)
             patch.normal += theta * n
             patch.drift += float(theta) * samples.drift[j, u]
             offset += theta * away
@@ -329,7 +316,6 @@ def find_pairs(
     basis: Basis,
     state: NewtonState,
     samples: Samples,
-    curvature: wp.array[float],  # (sample_total,), mean of the asset at rest [1/m]
     # In and out:
     pairs: Pairs,
 ):
@@ -379,7 +365,7 @@ def find_pairs(
         nearest = sample[slot]
         if j < 0:
             return
-        patch = fit_patch(instances, basis, samples, curvature, pairs, i, s, j, nearest)
+        patch = fit_patch(instances, basis, samples, pairs, i, s, j, nearest)
         gap = patch.gap - wp.float64(instances.contact_radius[i] + instances.contact_radius[j])
         reach = instances.margin[i]
         if looks_at(pairs, i, s, j, nearest):

@@ -125,7 +125,7 @@ class SoftPairs:
         pairs, instances, basis = self.table, self.instances, self.basis
         every, count, constraint_max = samples.position.shape, self.layout.instance_count, constraints.row.shape[1]
         self._launch(kernels.place_surface, every, instances, basis, motion, samples, pairs)
-        self._launch(kernels.find_pairs, every, instances, basis, state, samples, self.surface.curvature, pairs)
+        self._launch(kernels.find_pairs, every, instances, basis, state, samples, pairs)
         launch_teams(self.device, kernels.compact_pairs, count, self.team, instances, self.team, pairs, state.status)
         found = (pairs, constraints, state.status)
         self._launch(kernels.accept_pairs, self.layout.world_count, state, constraint_max, *found)
