@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 import warp as wp
 
-from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.gradients.adjoint import AdjointOptions, AdjointReduced
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from softmode.errors import ConfigError, SolverDiverged
-from tests.bodies import cube, smooth_ball
+from tests.bodies import cube
 from tests.scenes import GRAVITY, Scene
 
 EXACT = SolverReducedOptions(tolerance=1.0e-12, force_tolerance=1.0e-12, iteration_max=100, friction_lag=100)
@@ -35,7 +34,6 @@ class Landing:
         turntable: Whether it lands on a box that turns, instead of on the ground.
         height: Of its centre at the start [m].
         stiffness: Contact stiffness per area [Pa/m]; None for the one that follows the body.
-        body: What lands, 5 cm from its centre; None for the cube.
     """
 
     def __init__(
@@ -46,11 +44,10 @@ class Landing:
         turntable: bool = False,
         height: float = 0.0505,
         stiffness: float | None = None,
-        body: ReducedBody | None = None,
     ) -> None:
         """Build the scene and random weights of the loss."""
-        self.friction, self.least = friction, 10 if body is None else 3
-        body, worlds = body or cube(), len(youngs_modulus)
+        body, worlds = cube(), len(youngs_modulus)
+        self.friction = friction
 
         def populate(world: newton.ModelBuilder) -> None:
             material = Material(viscosity=0.005, density=500.0, friction=friction)
@@ -107,7 +104,7 @@ class Landing:
     def gradients(self) -> dict[str, np.ndarray]:
         """Return the gradients of the unchanged run, which must touch something."""
         self.run()
-        assert self.scene.reduced.view.constraints.count.numpy().min() > self.least
+        assert self.scene.reduced.view.constraints.count.numpy().min() > 10
         return self.adjoint.backward(loss_q=self.weight).numpy()
 
     def difference(self, name: str, relative: float) -> float:
@@ -145,8 +142,7 @@ def test_frictionless_contact(youngs_modulus: float) -> None:
     gradients = case.gradients()
     for name in ("youngs_modulus", "poissons_ratio", "density", "scale", "qd"):
         found = case.gradient(gradients, name)
-        step = 1.0e-4 if name == "qd" else 3.0e-4
-        assert found == pytest.approx(case.difference(name, step), rel=1.0e-3), name
+        assert found == pytest.approx(case.difference(name, 3.0e-4), rel=1.0e-3), name
     assert gradients["grad_residual"].max() < 1.0e-10
 
 
@@ -190,7 +186,7 @@ def test_frictional_contact(options: SolverReducedOptions) -> None:
     """
     case = Landing(1.0e5, friction=0.8, options=options)
     gradients = case.gradients()
-    steps = {"youngs_modulus": 1e-3, "poissons_ratio": 1e-4, "density": 1e-3, "friction": 3e-4, "qd": 1e-5, "q": 1e-5}
+    steps = {"youngs_modulus": 1e-3, "poissons_ratio": 1e-4, "density": 1e-3, "friction": 1e-3, "qd": 1e-5, "q": 1e-5}
     for name, relative in steps.items():
         assert case.gradient(gradients, name) == pytest.approx(case.difference(name, relative), rel=1.0e-2), name
     assert gradients["grad_residual"].max() < 1.0e-10
@@ -200,25 +196,6 @@ def test_frictional_contact(options: SolverReducedOptions) -> None:
         force, slip = (getattr(constraints, name).numpy()[0, :count] for name in ("force", "slip"))
         sticks = np.isclose(np.linalg.norm(force[:, :2], axis=1), force[:, 2] * 0.8, rtol=1e-3)
         assert slip.any() and 0 < sticks.sum() < count
-
-
-def test_ball_that_rolls() -> None:
-    """A ball lands and rolls: its cells' ranges, centres of pressure and neighbourhoods follow the state in every step.
-
-    Held constant they give -0.26 of dL/dE and 1.6 of dL/drho. Within 1e-2 of differences.
-    """
-    case = Landing(1.0e5, friction=0.8, body=smooth_ball(8, 400))
-    gradients = case.gradients()
-    steps = {
-        "youngs_modulus": 1e-3,
-        "poissons_ratio": 1e-4,
-        "density": 1e-3,
-        "scale": 1e-4,
-        "friction": 1e-3,
-        "qd": 1e-5,
-    }
-    for name, relative in steps.items():
-        assert case.gradient(gradients, name) == pytest.approx(case.difference(name, relative), rel=1.0e-2), name
 
 
 def test_friction_on_a_turntable() -> None:

@@ -132,14 +132,15 @@ def test_hertz(youngs_modulus: float) -> None:
 def test_follows_parameters() -> None:
     """The force goes with E as it is now, and at equal d / R with the square of the scale; to what float32 leaves.
 
-    All in one pose: damped so that a ball that would turn, until it lies on some of its samples, hardly does.
+    All in the pose in which the ball has come to rest: a ball turns until it lies on some of its samples, and between
+    such poses the force differs by 0.2 %. With and without AVX-512 1.5e-6 was seen.
     """
-    press, depth = Press(smooth_ball(), RADIUS, damping=4.0e4), 0.04 * RADIUS
+    press, depth = Press(smooth_ball(), RADIUS), 0.04 * RADIUS
     force = press.force(depth, 80)
     rest = press.scene.q() + smooth_ball().linear_coordinates[:, :3]
     press.scene.set_parameter("youngs_modulus", 3.0e6)
     assert press.held() == pytest.approx(3.0 * force, rel=4.0e-6)
-    half = Press(smooth_ball(), RADIUS, scale=0.5, damping=4.0e4)
+    half = Press(smooth_ball(), RADIUS, scale=0.5)
     half.start(0.5 * depth)
     half.scene.set(q=0.5 * rest - smooth_ball().linear_coordinates[:, :3], qd=np.zeros_like(rest))
     assert half.held() == pytest.approx(0.25 * force, rel=4.0e-6)
@@ -267,7 +268,7 @@ def test_skin_stays_out() -> None:
 
 def test_soft_bodies_share_their_dents() -> None:
     """Two spheres in a row of which one is four times as stiff: the dents between them go as their compliances."""
-    press = Press(smooth_ball(8, 400), RADIUS, count=2, damping=1.0e4)  # without friction the row would buckle
+    press = Press(smooth_ball(8, 400), RADIUS, count=2)
     press.scene.set_parameter("youngs_modulus", (1.0e6, 4.0e6))
     press.force(0.02 * RADIUS)
     dent = press.scene.state.softmode.dent.numpy().reshape(2, -1, 3)

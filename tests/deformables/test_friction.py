@@ -166,8 +166,8 @@ def test_force_stays_in_the_cone():
         tangential = np.linalg.norm(f - normal[:, None] * n, axis=1)
         lagged = entries.normal_force.numpy()[0, :count]
         assert (tangential <= MU * lagged * (1 + 1e-9)).all()
-        # it follows the contact for eight iterations, in most steps nearly to the end
-        np.testing.assert_allclose(lagged, normal, atol=2e-4 * scene.mass() * GRAVITY)
+        # it follows the contact for eight iterations, in most steps to the end
+        np.testing.assert_allclose(lagged, normal, atol=1e-4 * scene.mass() * GRAVITY)
         assert (f @ along <= 1e-9).all()
         seen += int((normal > 0).sum())
     assert seen > 100
@@ -269,7 +269,7 @@ def test_stick_is_the_return_map():
     count = int(entries.count.numpy()[0])
     f, k = entries.force.numpy()[0, :count], entries.stick.numpy()[0, :count]
     shapes, points = memory(scene)
-    rows = entries.partner_row.numpy()[0, :count]
+    rows = entries.row.numpy()[0, :count]
     held = (f**2).sum(axis=1) > 0.0
     world = points[rows, 0] @ rotation((0, 1, 0), np.arctan(1.5 * MU)).T
     n = entries.normal.numpy()[0, :count]

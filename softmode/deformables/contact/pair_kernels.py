@@ -24,25 +24,16 @@ whose row is the difference.
 
 import warp as wp
 
-from softmode.deformables.contact.cell_kernels import (
-    Surface,
-    cell_at,
-    fade_of,
-    gradient_of,
-    shape_of_cell,
-    spared_share,
-)
 from softmode.deformables.contact.detection_kernels import rank_contacts
 from softmode.deformables.contact.penalty_kernels import (
     BULK_FACTOR,
-    HARDENING_DEPTH,
     SHEAR_FACTOR,
     dent_compliance,
     dent_depth,
-    shear_yield,
     stiffness_per_area,
 )
 from softmode.deformables.model.declare import struct
+from softmode.deformables.model.deformation_kernels import displacement_gradient
 from softmode.deformables.model.lane_kernels import vec8
 from softmode.deformables.model.status import WORLD_CONTACT_OVERFLOW, WORLD_PENETRATION
 from softmode.deformables.model.struct_kernels import (
@@ -105,7 +96,6 @@ class Pairs:
     gap: wp.array3d[wp.float64]  # (..., SLOTS) [m]
     normal: wp.array3d[wp.vec3d]  # (..., SLOTS), outward from the other body
     nearest: wp.array3d[int]  # (..., SLOTS), its nearest sample
-    share: wp.array3d[float]  # (..., SLOTS), of the sample's own body in the dent of both
     tally: wp.array3d[int]  # (instance_count, team, 2), scratch of the list
     held: wp.array3d[int]  # (..., SLOTS), the point constraint it became, -1 for none
     count: wp.array[int]  # (instance_count,)
@@ -122,6 +112,14 @@ class Patch:
     gap: wp.float64  # [m]
     normal: wp.vec3d
     drift: wp.vec3  # mean motion of the step [m]
+
+
+@wp.func
+def gradient_at(instances: Instances, basis: Basis, motion: Motion, i: int, s: int):
+    """Return the deformation gradient F of an instance at a surface sample, at the start of the step."""
+    row = instances.row_start[i] + s
+    G = displacement_gradient(basis.row_gradient, motion.q_start, i, row, instances.function_count[i])
+    return wp.identity(n=3, dtype=wp.float64) + G
 
 
 @wp.func
@@ -181,7 +179,7 @@ def place_surface(
     i, s = wp.tid()
     if s >= instances.sample_count[i] or pairs.near[i] == 0:
         return
-    F = gradient_of(instances, basis, motion.q_start, i, instances.row_start[i] + s)
+    F = gradient_at(instances, basis, motion, i, s)
     normal = wp.normalize(cofactor(F) * wp.vec3d(basis.row_normal[instances.row_start[i] + s]))
     pairs.surface_normal[i, s] = wp.vec3(normal)
 
@@ -467,7 +465,8 @@ def write_pairs(
     motion: Motion,
     samples: Samples,
     state: NewtonState,
-    surface: Surface,
+    relative_stiffness: wp.array[float],  # (sample_total,), Young's modulus relative to the body's
+    dent_length: wp.array[float],  # (sample_total,), see ``dents`` [m]
     stick_ratio: wp.float64,
     stick_partner: wp.array[wp.vec2i],  # (particle_count,), see ``friction_memory_kernels``
     stick_slip: wp.array[mat23d],  # (particle_count,) [m]
@@ -509,7 +508,7 @@ def write_pairs(
     inverse = wp.float64(1.0) / total
     # carried on to x; of the same body, the difference to it
     offset = inverse * offset - wp.max(pairs.gap[i, s, slot], wp.float64(0.0)) * pairs.normal[i, s, slot]
-    F = gradient_of(instances, basis, motion.q_start, j, at)
+    F = gradient_at(instances, basis, motion, j, nearest)
     X = wp.vec3(clamped_inverse(F, instances.scale[j]) * offset)
     for b in range(basis.row.shape[1]):
         value = float(inverse) * basis.row[row, b]
@@ -522,39 +521,26 @@ def write_pairs(
 
     # each of the two surfaces brings its samples, so that each counts one half
     half_area = wp.max(0.5 * sample_area(instances.scale[i], basis.row_area[own]), 1.0e-30)
-    ri = surface.relative_stiffness[own]
-    rj = surface.relative_stiffness[at]
-    firm_i = ri * surface.slenderness[own]
-    firm_j = rj * surface.slenderness[at]
-    stiffness = wp.float64(layers_in_series(instances, i, j, BULK_FACTOR, firm_i, firm_j, dt) * half_area)
+    ri = relative_stiffness[own]
+    rj = relative_stiffness[at]
+    stiffness = wp.float64(layers_in_series(instances, i, j, BULK_FACTOR, ri, rj, dt) * half_area)
     shear = wp.float64(layers_in_series(instances, i, j, SHEAR_FACTOR, ri, rj, dt) * half_area)
-    n = pairs.normal[i, s, slot]
-    mine = shape_of_cell(surface, instances, basis, i, own, surface.curvature[at] / instances.scale[j])
-    F_own = gradient_of(instances, basis, motion.q_start, i, own)
-    fade = fade_of(mine, F_own, n)
-    theirs = shape_of_cell(surface, instances, basis, j, at, surface.curvature[own] / instances.scale[i])
-    spared_i = float(spared_share(surface, pairs.other, pairs.gap, mine, fade, i, own, j))
-    spared_j = float(spared_share(surface, pairs.other, pairs.gap, theirs, fade, j, at, i))
-    wi = wp.float64(spared_i * dent_compliance(instances, i, ri, surface.dent_length[own]) / half_area)
-    wj = wp.float64(spared_j * dent_compliance(instances, j, rj, surface.dent_length[at]) / half_area)
-    compliance = wi + wj
-    cell = cell_at(mine, F_own, n, pairs.gap[i, s, slot], wp.float64(0.0), stiffness * compliance)
-    stick = stick_ratio * shear
-    stick = stick / (wp.float64(1.0) + stick * (shear_yield(instances, i, wi) + shear_yield(instances, j, wj)))
-    pairs.share[i, s, slot] = float(wi / wp.max(compliance, wp.float64(1.0e-30)))
+    wi = dent_compliance(instances, i, ri, dent_length[own]) / half_area
+    wj = dent_compliance(instances, j, rj, dent_length[at]) / half_area
+    compliance = wp.float64(wi + wj)
     thick = wp.max(instances.scale[i] * pairs.thickness[own], instances.scale[j] * pairs.thickness[at])
-    depth = spared_i * dent_depth(instances, i, surface.dent_length[own], True)
-    depth += spared_j * dent_depth(instances, j, surface.dent_length[at], True)
+    depth = dent_depth(instances, i, dent_length[own]) + dent_depth(instances, j, dent_length[at])
     depth = wp.min(depth, 0.5 * DEPTH * thick)
     friction = wp.float64(wp.sqrt(instances.friction[i] * instances.friction[j]))
+    n = pairs.normal[i, s, slot]
     deepest = -wp.float64(OVERLAP * wp.min(instances.size[i], instances.size[j]))
     if pairs.gap[i, s, slot] < deepest:
         wp.atomic_or(state.status, instances.world[i], WORLD_PENETRATION)
-    offset = (wp.max(pairs.gap[i, s, slot], deepest) - cell.lead) * n
+    offset = wp.max(pairs.gap[i, s, slot], deepest) * n
     particle = instances.particle_start[i] + s
     for before in range(SLOTS):
         if stick_partner[particle][before] == j - state.instance_start[instances.world[i]]:
-            slip = F_own * stick_slip[particle][before]
+            slip = gradient_at(instances, basis, motion, i, s) * stick_slip[particle][before]
             offset += slip - wp.dot(n, slip) * n
     pairs.held[i, s, slot] = pairs.constraint[i, k]
     for side in range(2):
@@ -576,11 +562,9 @@ def write_pairs(
             constraints.normal[a, e] = direction * n
             constraints.offset[a, e] = direction * offset
             constraints.stiffness[a, e] = stiffness
-            constraints.stick[a, e] = stick
+            constraints.stick[a, e] = stick_ratio * shear
             constraints.dent_compliance[a, e] = compliance
-            constraints.dent_depth[a, e] = wp.float64(depth) + HARDENING_DEPTH * mine.least
-            constraints.onset[a, e] = cell.onset
-            constraints.lead[a, e] = cell.lead
+            constraints.dent_depth[a, e] = wp.float64(depth)
             constraints.friction[a, e] = friction
 
 
@@ -616,7 +600,7 @@ def remember_pairs(
         stretch = constraints.stick[i, e] * wp.length(total)
         if not (limit > wp.float64(0.0) and stretch > wp.float64(0.0) and wp.isfinite(stretch + limit)):
             continue
-        F = gradient_of(instances, basis, motion.q_start, i, instances.row_start[i] + s)
+        F = gradient_at(instances, basis, motion, i, s)
         elastic = clamped_inverse(F, instances.scale[i]) * (wp.min(wp.float64(1.0), limit / stretch) * total)
         partner[slot] = pairs.other[i, s, slot] - state.instance_start[instances.world[i]]
         slips[slot] = elastic
