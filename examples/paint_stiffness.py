@@ -75,17 +75,15 @@ def measure(scene: SplatScene) -> tuple[np.ndarray, list[np.ndarray]]:
     """Return the modulus along z of each block [Pa], and the strain of each at its points."""
     energies = SoftEnergies(scene.solver)
     energies.update(scene.state)
-    bodies = [block.body for block in scene.objects]
-    strains = [b.cubature.grad_basis[:, :, 2] @ q[:, 2] for b, q in zip(bodies, motion_of(scene).q, strict=True)]
-    mean = np.array([np.average(strain, weights=b.cubature.weights) for b, strain in zip(bodies, strains, strict=True)])
-    return 2.0 * energies.elastic.numpy() / (bodies[0].volume * mean**2), strains
+    points = [block.body.cubature for block in scene.objects]
+    strains = [p.grad_basis[:, :, 2] @ q[:, 2] for p, q in zip(points, motion_of(scene).q, strict=True)]
+    mean = np.array([np.average(strain, weights=p.weights) for p, strain in zip(points, strains, strict=True)])
+    return 2.0 * energies.elastic.numpy() / (scene.objects[0].body.volume * mean**2), strains
 
 
 def test_final(blocks: list[SoftObject], moduli: np.ndarray, strains: list[np.ndarray]) -> None:
     """Paint covers what was drawn; moduli are those of springs in a row and side by side, strains as 1/s in the row."""
-    mean = np.array(
-        [np.average(block.body.cubature.stiffness_scale, weights=block.body.cubature.weights) for block in blocks]
-    )
+    mean = np.array([np.average(p.stiffness_scale, weights=p.weights) for p in (b.body.cubature for b in blocks)])
     np.testing.assert_allclose(mean[1:3], 0.5 * (1.0 + FACTOR), rtol=0.02)
     scale, weights = blocks[1].body.cubature.stiffness_scale, blocks[1].body.cubature.weights
     found, expected = moduli / moduli[0], np.array([1.0, 1.0 / np.average(1.0 / scale, weights=weights), *mean[2:]])

@@ -237,7 +237,7 @@ def test_every_segment_is_what_the_state_says(make_env: MakeEnv, name: str) -> N
     own = TASKS[name]
     env = make_env(name).unwrapped
     assert isinstance(env, SoftEnv)
-    segments, largest, touched, dented = env.task.segments, np.zeros(len(env.task.low)), False, 0.0
+    segments, largest, touched, dented = env.task.segments, np.zeros(len(env.task.layout.low)), False, 0.0
 
     def check() -> None:
         nonlocal touched, dented
