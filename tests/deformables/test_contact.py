@@ -15,7 +15,7 @@ from softmode.deformables.model.authoring import add_reduced_body
 from softmode.deformables.model.struct_kernels import OVERLAP
 from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
 from tests import reference
-from tests.bodies import cube
+from tests.bodies import changed, cube
 from tests.deformables.probe_kernels import evaluate_potentials
 from tests.deformables.test_coupling import impact, totals
 from tests.scenes import GRAVITY, Scene, rotation
@@ -199,7 +199,7 @@ def test_automatic_stiffness_follows_the_parameters(dt):
 def test_automatic_stiffness_is_that_of_the_touching_part(count):
     """A cube whose half is ten times as stiff touches with kappa(E) there and kappa(10 E) here; in pairs in series."""
     jump = np.where(cube().cubature.points[:, 0] < 0.0, 1.0, 10.0)
-    body = dataclasses.replace(cube(), stiffness_scale=jump, fingerprint="a cube of two halves")
+    body = changed(cube(), stiffness_scale=jump, fingerprint="a cube of two halves")
     material, dt = Material(youngs_modulus=1.0e6), 0.02
 
     def populate(world):
