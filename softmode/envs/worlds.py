@@ -97,7 +97,7 @@ class LocalWorlds:
 
     def render(self) -> NDArray[np.uint8]:
         """Return a frame per world."""
-        return film_of(self.task)
+        return self.task.film.draw(self.task)
 
     def close(self) -> None:
         """Do nothing."""
@@ -286,11 +286,6 @@ def spaces_of(task: Task) -> tuple[gym.spaces.Box, gym.Space]:
     if task.obs_type == "pixels_agent_pos":
         spaces["agent_pos"] = layout.space(slice(0, layout.agent_size))
     return actions, spaces["pixels"] if list(spaces) == ["pixels"] else gym.spaces.Dict(spaces)
-
-
-def film_of(task: Task) -> NDArray[np.uint8]:
-    """Return a frame per world: the pictures of the film cameras side by side."""
-    return task.film.draw(task)
 
 
 def info_arrays(task: Task, *, final: bool = False) -> dict[str, Tree]:

@@ -46,15 +46,16 @@ def transported(points: Array, mass: Array, target: Array, grid: Grid) -> Array:
     box = tuple(slice(begin, end) for begin, end in zip(low, high, strict=True))
     a, b = (m[box].astype(np.float64) / m.sum(dtype=np.float64) for m in (mass, target))
     least = (float((high - low).max()) / FARTHEST) ** 2
-    log_v, last, v, kernel = np.zeros(b.shape), 1.0, b, [b]
+    kernel: list[Array] = []
+    v, last = (b > 0.0).astype(np.float64), 1.0
     for stage, count in STAGES:
         entropy = max(stage, least)
         kernel = [np.exp(-(np.subtract.outer(k, k) ** 2) / entropy) for k in map(np.arange, a.shape)]
-        v = np.where(b > 0.0, np.exp(np.clip(log_v * last / entropy, -600.0, 600.0)), 0.0)
+        log_v = np.log(np.maximum(v, TINY)) * last / entropy
+        v, last = np.where(b > 0.0, np.exp(np.clip(log_v, -600.0, 600.0)), 0.0), entropy
         for _ in range(count):
             u = a / np.maximum(_smeared(kernel, v), TINY)
             v = b / np.maximum(_smeared(kernel, u), TINY)
-        log_v, last = np.log(np.maximum(v, TINY)), entropy
     at = np.stack(np.meshgrid(*map(np.arange, a.shape), indexing="ij"), axis=-1).astype(np.float64)
     reach = np.maximum(_smeared(kernel, v), TINY)
     moved = np.stack([_smeared(kernel, v * at[..., axis]) / reach for axis in range(3)], axis=-1) - at

@@ -39,7 +39,7 @@ _SHARES = (1.0, 0.75, 0.5, 0.3)
 _HEIGHTS = (0.0, 0.15, 0.3, 0.45)
 """How high above the table the base is tried, in turn [m]."""
 _POSES = 4000
-"""Most poses that a search for a base tries: about 2 s on a laptop."""
+"""Most poses that a search for a base tries."""
 _FIRST = 25
 """Steps of the inverse kinematics after which a pose is given up that is farther off than `_HOPE`."""
 _HOPE = 0.03

@@ -623,11 +623,7 @@ def test_a_recording_of_coordinates_is_played_back(hanging, tmp_path):
 
 def test_a_recording_keeps_dents(tmp_path):
     """What stands on the table is shown again with the dents that it had: surface and splats, while it is elsewhere."""
-    round_one = ObjectConfig(shape="sphere", extents=(0.05, 0.05, 0.05), build=BUILD)
-    live, path = (
-        LiveSession.from_object(round_one, scene="drop", material=SOFT, options=PATIENT),
-        tmp_path / "stand.npz",
-    )
+    live, path = session("drop"), tmp_path / "stand.npz"
     settle(live, 60)
     live.start_recording(path)
     settle(live, 2)
