@@ -30,6 +30,8 @@ class Handling:
         strain_limit: Largest principal strain of a safe success.
         force_limit: Largest contact force of a safe success [N]; None for 15 N, or three times the force of each finger
             that holds the heaviest object's weight by friction, if that is more.
+        care: What the reward loses where the logarithm of the peaks rises, see `roughness`.
+        gentle: Column of that term of the reward, -1 for none.
 
     Attributes:
         handled: `HANDLED`, shape (world_count, 5): contact force [N], principal strain and energy density [J/m^3] at
@@ -39,7 +41,16 @@ class Handling:
         at_goal: Which objects may be let go where they are, a bit each; the task's `evaluate` writes it.
     """
 
-    def __init__(self, scene: TableScene, friction: int, strain_limit: float, force_limit: float | None) -> None:
+    def __init__(
+        self,
+        scene: TableScene,
+        friction: int,
+        *,
+        strain_limit: float,
+        force_limit: float | None,
+        care: float = 0.0,
+        gentle: int = -1,
+    ) -> None:
         """Allocate the figures and watch the scene."""
         worlds, device = scene.world_count, scene.device
         self._device, self._worlds = device, worlds
@@ -48,7 +59,7 @@ class Handling:
             pads = ParallelJaw.of(scene.config.arm).friction
         except ConfigError:  # a robot without a gripper holds nothing
             pads = 1.0
-        self._limits = (strain_limit, -1.0 if force_limit is None else force_limit, pads, friction)
+        self._limits = (strain_limit, -1.0 if force_limit is None else force_limit, pads, friction, care, gentle)
         self.handled = wp.zeros((worlds, len(HANDLED)), dtype=float, device=device)
         self.safe = wp.zeros(worlds, dtype=wp.bool, device=device)
         self.step_force, self.step_strain, self.force_limit, self.height = (

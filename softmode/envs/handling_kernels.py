@@ -40,6 +40,17 @@ class Handling:
 
 
 @wp.func
+def roughness(handling: Handling, world: int, strain_limit: float):
+    """Return how much more than gently the objects were handled so far, 0 up to half of each limit.
+
+    It is the logarithm of twice the greater of peak force and peak strain, each relative to its limit.
+    """
+    force = handling.handled[world, Handled.peak_force] / wp.max(handling.force_limit[world], 1.0e-6)
+    used = wp.max(force, handling.handled[world, Handled.peak_strain] / strain_limit)
+    return wp.log(wp.max(2.0 * used, 1.0))
+
+
+@wp.func
 def principal_strain(G: wp.mat33):
     """Return the largest |s - 1| of the principal stretches s of F = I + G.
 
@@ -116,6 +127,8 @@ def judge(
     force_limit: float,  # [N], negative for that of the object's weight
     pad_friction: float,
     friction: int,  # column of the parameters
+    care: float,  # what the reward loses for roughness
+    gentle: int,  # column of that term, -1 for none
     state: WorldState,
     result: StepResult,
     instances: Instances,
@@ -125,10 +138,6 @@ def judge(
 ):
     """Raise peaks, count slips and drops, and say whether a success is within the limits; once per control step."""
     w = wp.tid()
-    if not fresh[w]:
-        handled = handling.handled
-        handled[w, Handled.peak_force] = wp.max(handled[w, Handled.peak_force], handling.step_force[w])
-        handled[w, Handled.peak_strain] = wp.max(handled[w, Handled.peak_strain], handling.step_strain[w])
     tool = state.tool_pose[w]
     near = int(0)
     nearest = float(1.0e9)
@@ -143,6 +152,13 @@ def judge(
     pads = wp.sqrt(wp.max(state.parameters[w, friction] * pad_friction, 1.0e-6))
     holds = 0.5 * heaviest * wp.length(gravity[w]) / pads
     handling.force_limit[w] = wp.where(force_limit > 0.0, force_limit, wp.max(LEAST_FORCE, MARGIN * holds))
+    before = roughness(handling, w, strain_limit)
+    if not fresh[w]:
+        handled = handling.handled
+        handled[w, Handled.peak_force] = wp.max(handled[w, Handled.peak_force], handling.step_force[w])
+        handled[w, Handled.peak_strain] = wp.max(handled[w, Handled.peak_strain], handling.step_strain[w])
+    if gentle >= 0:
+        result.terms[w, gentle] = care * (before - roughness(handling, w, strain_limit))
     if grasped(state, w):
         x = state.object_position[w, near]
         offset = wp.transform_point(wp.transform_inverse(tool), x)

@@ -175,8 +175,14 @@ class Task:
             counts = {"terms": len(self.term_names), "metrics": len(self.metric_names)}
             self.episodes = Episodes(world_count, **counts, limit=limit, sparse=sparse, device=self.device)
             self.terms, self.metrics, self.success = self.episodes.terms, self.episodes.metrics, self.episodes.success
-            limits = (config.strain_limit, config.force_limit)
-            self.handling = Handling(scene, self.table.column("friction"), *limits)
+            self.handling = Handling(
+                scene,
+                self.table.column("friction"),
+                strain_limit=config.strain_limit,
+                force_limit=config.force_limit,
+                care=config.care,
+                gentle=self.term_names.index("gentle") if "gentle" in self.term_names else -1,
+            )
             self.outcome: dict[str, wp.array] = {
                 "success": self.success,
                 "safe": self.handling.safe,

@@ -79,6 +79,9 @@ class TaskConfig:
     """Largest principal strain of an object for a success to be safe."""
     force_limit: float | None = None
     """Largest contact force on it [N]; None for 15 N, or three times what holds its weight, if that is more."""
+    care: float = 0.0
+    """What the reward loses for rough handling, of tasks with the term ``gentle``: this times how much the logarithm of
+    peak force or peak strain, whichever is nearer to its limit, rises beyond half of the limit."""
     camera: CameraName = "front"
     """Camera of pixel observations: one in front of the table, or one on the hand."""
     image_size: int = 96
@@ -104,6 +107,7 @@ class TaskConfig:
         require_numbers("position_range", self.position_range, 2, at_least=0.0, unit="m")
         require_number("others_clearance", self.others_clearance, at_least=0.0, at_most=0.5, unit="m")
         require_number("strain_limit", self.strain_limit, above=0.0)
+        require_number("care", self.care, at_least=0.0)
         if self.force_limit is not None:
             require_number("force_limit", self.force_limit, above=0.0, unit="N")
         require_number("yaw_range", self.yaw_range, at_least=0.0, unit="rad")

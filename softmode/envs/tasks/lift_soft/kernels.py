@@ -8,7 +8,7 @@ from softmode.envs.reward_kernels import NEAR, StepResult, WorldState, count_hel
 
 wp.set_module_options({"enable_backward": False})
 
-Term = IntEnum("Term", "reach grasp lift goal hold", start=0)
+Term = IntEnum("Term", "reach grasp lift goal hold gentle", start=0)
 Metric = IntEnum("Metric", "object_height goal_distance", start=0)
 
 

@@ -19,7 +19,7 @@ from softmode.envs.reward_kernels import (
 
 wp.set_module_options({"enable_backward": False})
 
-Term = IntEnum("Term", "reach grasp carry release rest", start=0)
+Term = IntEnum("Term", "reach grasp carry release rest gentle", start=0)
 Metric = IntEnum("Metric", "object_height bin_distance others_inside", start=0)
 
 
