@@ -59,13 +59,13 @@ $(VENV)/.demo: $(VENV)/.created pyproject.toml constraints.txt
 $(VENV)/.dev: $(VENV)/.created pyproject.toml constraints.txt
 	$(INSTALL) --editable '.[dev]' || $(BIN)/python -m pip install --quiet -c constraints.txt --editable '.[dev]'
 	$(BIN)/python -c 'import torch' 2>/dev/null || $(BIN)/python -m pip install --quiet '$(TORCH)'
-	$(BIN)/python -m pip install --quiet -c constraints.txt stable-baselines3 tensorboard rsl-rl-lib skrl
+	$(BIN)/python -m pip install --quiet -c constraints.txt stable-baselines3 tensorboard rsl-rl-lib skrl onnxruntime
 	@touch $@ $(VENV)/.demo
 
 # All but torch, whose wheel (CPU, or one of several for CUDA) is the machine's choice, and what only that needs.
 lock: $(VENV)/.created  ## pin the newest versions that pyproject.toml allows
 	$(UV) pip compile --quiet --universal --upgrade --python-version 3.11 --extra demo --extra dev --extra bench --extra rl \
-	  --extra rsl-rl --extra skrl --override <(echo "torch; python_version < '3'") --no-header --no-annotate \
+	  --extra rsl-rl --extra skrl --extra onnx --override <(echo "torch; python_version < '3'") --no-header --no-annotate \
 	  --no-emit-index-url pyproject.toml -o constraints.txt
 
 resolve: $(VENV)/.created  ## check that all extras resolve to wheels on every supported Python

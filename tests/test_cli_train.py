@@ -54,6 +54,8 @@ def test_export(tmp_path: Path, capsys):
     before = policy.read_bytes()
     assert cli.main(["export", str(folder / "latest.npz"), str(policy)]) == 2
     assert "exists" in capsys.readouterr().err and policy.read_bytes() == before
+    assert cli.main(["export", str(policy), str(tmp_path / "policy.pt")]) == 2
+    assert "'.onnx'" in capsys.readouterr().err
     assert cli.main(["export", str(folder / "config.json"), str(tmp_path / "other.npz")]) == 2
     assert "config.json" in capsys.readouterr().err and not (tmp_path / "other.npz").exists()
 

@@ -8,7 +8,7 @@ import os
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from softmode.checks import require_number
+from softmode.checks import require_choice, require_number
 from softmode.cli.common import (
     one_place,
     optional_argument,
@@ -158,7 +158,7 @@ class Export:
     checkpoint: Path
     """Checkpoint of a run, for example best.npz."""
     file: Annotated[Path | None, optional_argument()] = None
-    """File to write (.npz), not there yet; play, evaluate, --init and --teacher read it."""
+    """File to write, not there yet: .npz, which play, evaluate, --init and --teacher read, or .onnx for elsewhere."""
     out: Annotated[Path | None, short_name("-o")] = None
     """The same file, as an option."""
 
@@ -171,8 +171,14 @@ class Export:
         out = one_place(self.file, self.out)
         if out.exists():
             raise ConfigError(f"{out} exists", hint="remove it, or write another file")
-        load_policy(self.checkpoint)  # refuses a file whose actor does not fit its header
-        write_checkpoint(policy_only(read_checkpoint(self.checkpoint)), out)
+        require_choice("the ending of the file", out.suffix, (".npz", ".onnx"))
+        policy = load_policy(self.checkpoint)  # refuses a file whose actor does not fit its header
+        if out.suffix == ".onnx":
+            from softmode.learning.onnx_export import export_onnx
+
+            export_onnx(policy, out)
+        else:
+            write_checkpoint(policy_only(read_checkpoint(self.checkpoint)), out)
         print(f"{out}: {out.stat().st_size / 1e3:.0f} kB")
         return 0
 

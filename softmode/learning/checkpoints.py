@@ -71,6 +71,8 @@ def read_checkpoint(path: str | os.PathLike[str]) -> Checkpoint:
         CheckpointError: If the file is missing, damaged, foreign, or of another version.
     """
     hint = "give the policy.npz, best.npz or latest.npz of a run of this version of softmode"
+    if os.fspath(path).endswith(".onnx"):
+        raise CheckpointError(f"{path} is an ONNX graph, which softmode does not play", hint=hint)
     header, stored = read_archive(path, FORMAT, FORMAT_VERSION, what="checkpoint", hint=hint, error=CheckpointError)
     with damage_errors(f"checkpoint {path}", hint=hint, error=CheckpointError):
         if header["arrays"] != sorted(stored):

@@ -23,7 +23,7 @@ from softmode.learning.checkpoints import Checkpoint, check_env, read_checkpoint
 from softmode.learning.config_values import located_options, with_config
 from softmode.learning.distributed import local_device
 from softmode.learning.intervals import wilson_interval
-from softmode.learning.networks import Actor
+from softmode.learning.networks import Actor, Observation
 from softmode.learning.spaces import Interface
 from softmode.learning.vector_tensors import TensorVectorEnv, action_range, tensors_of
 
@@ -78,6 +78,10 @@ class Policy:
         spec = getattr(env, "spec", None)
         check_env(self.checkpoint, self._path, None if spec is None else spec.id, Interface.of(env))
 
+    def act(self, observation: Observation) -> torch.Tensor:
+        """Return actions in the environment's range, shape (n, action), for tensors of the interface."""
+        return self._center + self._half * self.actor(observation)
+
     @torch.no_grad()
     def __call__(self, observation: Any) -> Any:
         """Return the action for one observation or a batch of them."""
@@ -95,7 +99,7 @@ class Policy:
                     f"observation {key} has shape {tuple(tensors[key].shape)}, expected (n, *{shape}) or {shape}",
                     hint="use the obs_type of the policy's run",
                 )
-        action = self._center + self._half * self.actor(tensors)
+        action = self.act(tensors)
         action = action[0] if single else action
         given = next(iter(observation.values())) if isinstance(observation, dict) else observation
         return action if isinstance(given, torch.Tensor) else action.cpu().numpy()
