@@ -23,6 +23,7 @@ from softmode.cli.robot_options import RobotOptions
 from softmode.envs.catalogue import is_soft
 from softmode.errors import ConfigError
 from softmode.learning.players import require_torch
+from softmode.learning.run_folder import checkpoint_in
 from softmode.learning.train_options import RunOptions, TrainOptions
 
 
@@ -101,7 +102,9 @@ class Evaluate:
     env: str
     """Id of the environment, for example softmode/LiftSoft-v0, or module:id of your own."""
     policy: Path
-    """Checkpoint of a run, for example best.npz."""
+    """Checkpoint of a run, for example best.npz, or the run's folder."""
+    checkpoint: Literal["best", "latest"] = "best"
+    """Which one, of a folder."""
     episodes: int = 200
     """Number of episodes."""
     num_envs: int = 16
@@ -131,7 +134,7 @@ class Evaluate:
         from softmode.learning.policy import evaluate, load_policy
 
         require_number("num_envs", self.num_envs, at_least=1, hint="give a count like 16")
-        policy = load_policy(self.policy, self.device)
+        policy = load_policy(checkpoint_in(self.policy, self.checkpoint), self.device)
         options = {**policy.env_options, **parse_env_options(self.env_options, self.obs_type)}
         options = self.toy.env_options(self.env, options) | self.arm.env_options()
         limits = {"strain_limit": self.strain_limit, "force_limit": self.force_limit}

@@ -196,6 +196,8 @@ def set_worlds_state(
         _write(*chosen[_OBJECT], values[_OBJECT])
         task.scene.use_objects()
     task.materials.apply(task.scene.world_mask)
+    if task.disturbances is not None:
+        task.disturbances.set_drives()
     for name, array, count in parts:
         _write(array, count, values[name])
     task.scene.observe()

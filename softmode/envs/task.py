@@ -20,6 +20,7 @@ from softmode.deformables.model.structs import filled
 from softmode.deformables.reduction.build_body import Progress
 from softmode.envs import task_kernels as kernels
 from softmode.envs.cameras import overview, square_camera, wrist_camera
+from softmode.envs.disturbances import Disturbances, disturbance_parameters, disturbed, last_actions
 from softmode.envs.episodes import FALL, Episodes
 from softmode.envs.film import TaskFilm
 from softmode.envs.handling import Handling
@@ -72,6 +73,7 @@ class Task:
         segments: Columns of each of them by name.
         episodes: How far each episode is, what it earns, how it ends.
         handling: How gently the objects are handled.
+        disturbances: Delays, noise and bias, and drives that differ; None where all are off.
         placement: Puts objects down.
         pictures: What the cameras of an observation draw.
         film: What people watch.
@@ -171,6 +173,8 @@ class Task:
             self.rest_height, lowest = held.follow(heights), held.follow(heights - FALL)
             self.layout = _layout(self)
             self.segments, self.observation = self.layout.segments, self.layout.values
+            what = (config, scene, self.table, self.layout, limit)
+            self.disturbances = Disturbances(*what) if disturbed(config) else None
             sparse = config.reward_mode == "sparse" and not config.terms_follow_mode
             counts = {"terms": len(self.term_names), "metrics": len(self.metric_names)}
             self.episodes = Episodes(world_count, **counts, limit=limit, sparse=sparse, device=self.device)
@@ -279,6 +283,7 @@ class Task:
             ranged("friction", 0.0, 10.0),
             ranged("scale", 0.5, 2.0),
             *clutter_parameters(config, self.scene.occupancy, self.other_arcs()),
+            *disturbance_parameters(config),
         )
 
     def goal_segments(self) -> tuple[Segment, ...]:
@@ -321,6 +326,8 @@ class Task:
         names = ("elapsed", "end", "failure", "held", "terminated", "truncated", "success", "done")
         judged = {name: getattr(self.episodes, name) for name in (*names, "reward", "terms", "metrics")}
         kept = self.handling.state_arrays()
+        if self.disturbances is not None:
+            kept |= self.disturbances.state_arrays()
         return {**drawn, **judged, **kept, "finite": layout.finite, "observation": layout.values}
 
     def marker(self) -> Marker | None:
@@ -408,12 +415,16 @@ class Task:
             camera.randomize(scene.world_mask)
         self.episodes.clear(scene.world_mask, self.result)
         self.handling.forget(scene.world_mask)
+        if self.disturbances is not None:
+            self.disturbances.begin(scene.world_mask)
         self.clear()
 
     def write_observation(self) -> None:
         """Write the observation and the metrics of all worlds."""
         self.layout.write(self.state, self._arm)
         self.observe()
+        if self.disturbances is not None:
+            self.disturbances.disturb()
         self.layout.bound()
 
     def judge(self, fresh: wp.array) -> None:
@@ -432,6 +443,8 @@ class Task:
     def _step(self) -> None:
         """Simulate, judge, start the episodes that are due, observe."""
         scene, episodes = self.scene, self.episodes
+        if self.disturbances is not None:
+            self.disturbances.delay_actions()
         self.before_step()
         if self.autoreset_mode == AutoresetMode.NEXT_STEP:
             wp.copy(episodes.fresh, episodes.done)
@@ -457,8 +470,11 @@ def _layout(task: Task) -> ObservationTable:
     """Return the observation of a task, laid out in its segments."""
     held, given = task.scene.occupancy, task.config.object_set
     code = one_hot_part(given.count, held.slots) if given is not None and task.config.objects_one_hot else ()
-    agent = (*proprioception(task.scene.controller.joint_count), *task.goal_segments())
-    seen = (*object_part(task.point_count), *task.object_segments(), *others_part(held.slots - 1), *code)
+    last = last_actions(task.config, task.scene.controller.action_size)
+    goals = hasattr(task, "goal_size")  # whose observation is what lies between object and goal
+    agent = (*proprioception(task.scene.controller.joint_count), *(() if goals else last), *task.goal_segments())
+    seen = (*object_part(task.point_count), *(last if goals else ()), *task.object_segments())
+    seen = (*seen, *others_part(held.slots - 1), *code)
     return ObservationTable(agent, seen, task.world_count, task.device)
 
 

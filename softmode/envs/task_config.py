@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal, Self, get_args
 
 from softmode.checks import require_choice, require_number, require_numbers, require_range
+from softmode.envs.disturbances import LIMITS, SIM_TO_REAL
 from softmode.errors import ConfigError
 from softmode.objects.object_set import ObjectSet
 from softmode.scenes.table_scene import TableSceneConfig
@@ -24,6 +25,7 @@ _RANGES: dict[str, dict[str, float]] = {
     "density_range": {"above": 0.0},
     "friction_range": {"at_least": 0.0},
     "scale_range": {"above": 0.49, "below": 2.01},
+    **{f"{name}_range": limits for name, limits in LIMITS.items()},
 }
 """Limits of the ranges that may be None."""
 
@@ -75,6 +77,21 @@ class TaskConfig:
     """Range of the random friction coefficient of the object."""
     scale_range: tuple[float, float] | None = None
     """Range of the random size of the objects, as a factor."""
+    action_delay_range: tuple[float, float] | None = None
+    """Range of the random delay of actions [control steps]; of this and the six below None is off. What lies between
+    two steps is interpolated."""
+    observation_delay_range: tuple[float, float] | None = None
+    """Range of the random delay of observations [control steps]; with a delay the last three actions are observed."""
+    observation_noise_range: tuple[float, float] | None = None
+    """Range of the noise of observations in every step: 1 is 2 mm, 1 mm for the tool, 2 mrad for joints, 0.2 N."""
+    observation_bias_range: tuple[float, float] | None = None
+    """Range of an error of observations that stays throughout an episode, in the same units."""
+    gain_range: tuple[float, float] | None = None
+    """Range of a factor of stiffness and damping of the drives."""
+    drive_friction_range: tuple[float, float] | None = None
+    """Range of a dry friction of the drives, as a share of their effort limits."""
+    effort_range: tuple[float, float] | None = None
+    """Range of a factor of those limits."""
     strain_limit: float = 0.3
     """Largest principal strain of an object for a success to be safe."""
     force_limit: float | None = None
@@ -149,14 +166,16 @@ class TaskConfig:
 
     @classmethod
     def preset(cls, name: str) -> Self:
-        """Return a named variant of the task.
+        """Return a named variant of the task; "sim_to_real" is one of every task.
 
         Raises:
             ConfigError: If there is none of that name.
         """
-        known = cls.presets()
+        if name == "sim_to_real":
+            return cls(**SIM_TO_REAL)
+        known = {"sim_to_real": None, **cls.presets()}
         if name not in known:
-            names = ", ".join(map(repr, known)) or "none"
+            names = ", ".join(map(repr, known))
             raise ConfigError(f"{cls.__name__} has no preset {name!r}", hint=f"there are: {names}")
         return known[name]
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from softmode.errors import CheckpointError, ConfigError, needs_extra
+from softmode.learning.run_folder import checkpoint_in
 
 if TYPE_CHECKING:
     import gymnasium as gym
@@ -21,8 +22,8 @@ POLICIES = ("scripted", "random", "zero")
 
 
 def check_policy(name: str) -> None:
-    """Raise ConfigError if a policy is neither a name of :data:`POLICIES` nor a file."""
-    if name not in POLICIES and not Path(name).is_file():
+    """Raise ConfigError if a policy is neither a name of :data:`POLICIES` nor a file, nor the folder of a run."""
+    if name not in POLICIES and not checkpoint_in(Path(name)).is_file():
         raise ConfigError(
             f"unknown policy {name!r}", hint=f"use one of {', '.join(POLICIES)}, or the file of a trained policy"
         )

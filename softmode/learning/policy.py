@@ -24,11 +24,14 @@ from softmode.learning.config_values import located_options, with_config
 from softmode.learning.distributed import local_device
 from softmode.learning.intervals import wilson_interval
 from softmode.learning.networks import Actor, Observation
+from softmode.learning.run_folder import checkpoint_in
 from softmode.learning.spaces import Interface
 from softmode.learning.vector_tensors import TensorVectorEnv, action_range, tensors_of
 
 EVALUATION_SEED = 1_000_000_000
 """First seed of evaluation episodes; training draws its seeds below."""
+SELECTION_SEED = 1_500_000_000
+"""First seed of the episodes by which a run chooses its best checkpoint."""
 
 
 class Policy:
@@ -112,13 +115,14 @@ def load_policy(path: str | os.PathLike[str], device: str = "cpu") -> Policy:
     in the working folder.
 
     Args:
-        path: The file.
+        path: The file, or the folder of the run, whose best one it is then.
         device: Where the policy computes, for example cpu or cuda:0.
 
     Raises:
         CheckpointError: If the file is missing, damaged, foreign, or of another version.
         ConfigError: If the device is not there.
     """
+    path = checkpoint_in(Path(path))
     checkpoint = read_checkpoint(path)
     with damage_errors(f"checkpoint {path}: env_options", hint="use the file of another run", error=CheckpointError):
         options = located_options(checkpoint.env_options, Path(path).absolute().parent)
@@ -159,6 +163,8 @@ class Evaluation:
     """Mean length [control steps]."""
     safe_success_rate: float | None = None
     """Share of episodes that ended in success within the limits of force and strain; none as above."""
+    failed_seeds: tuple[int, ...] = ()
+    """Seeds of the episodes without success, as far as they were the first ones of their worlds."""
 
     def interval(self) -> tuple[float, float]:
         """Return the 95 % interval of the success rate (Wilson 1927)."""
@@ -213,7 +219,7 @@ def evaluate(
         lengths.append(length)
         outcomes.append((info.get("is_success"), info.get("is_safe_success")))
     known = (np.array(column, float) if None not in column else None for column in zip(*outcomes, strict=True))
-    return _summary(np.array(returns), np.array(lengths), *known)
+    return _summary(np.array(returns), np.array(lengths), np.arange(seed, seed + episodes), *known)
 
 
 def _evaluate_vector(
@@ -228,6 +234,7 @@ def _evaluate_vector(
     ended: list[torch.Tensor] = []
     observation, _ = env.reset(seed=seed)
     just_reset = torch.zeros(n, dtype=torch.bool, device=device)
+    own = torch.arange(1.0, n + 1.0, device=device)  # number of the world, which its first episode tells
     knows = [False, False]
     step_index = 0
     while True:
@@ -240,7 +247,7 @@ def _evaluate_vector(
         counted = done & (played < quota)
         known = [torch.zeros(n, device=device) if given is None else given for given in (step.success, step.safe)]
         knows = [k or given is not None for k, given in zip(knows, (step.success, step.safe), strict=True)]
-        ended.append(torch.stack([counted.float(), sums[0], sums[1], *known]))
+        ended.append(torch.stack([counted.float(), sums[0], sums[1], *known, (played == 0).float() * own]))
         played += counted
         sums *= (~done).float()
         just_reset = done
@@ -251,13 +258,21 @@ def _evaluate_vector(
     table = torch.stack(ended).permute(0, 2, 1).flatten(0, 1).cpu().numpy()
     table = table[table[:, 0] > 0]
     successes, safe = (table[:, 3 + k] if told else None for k, told in enumerate(knows))
-    return _summary(table[:, 1], table[:, 2], successes, safe)
+    firsts = table[:, 5].astype(np.int64)
+    return _summary(table[:, 1], table[:, 2], np.where(firsts > 0, seed - 1 + firsts, -1), successes, safe)
 
 
 def _summary(
-    returns: np.ndarray, lengths: np.ndarray, successes: np.ndarray | None, safe: np.ndarray | None
+    returns: np.ndarray,
+    lengths: np.ndarray,
+    seeds: np.ndarray,
+    successes: np.ndarray | None,
+    safe: np.ndarray | None,
 ) -> Evaluation:
+    """Return the figures of episodes; a seed is -1 where it is not that of the episode."""
+    failed = () if successes is None else np.sort(seeds[(successes == 0.0) & (seeds >= 0)]).tolist()
     return Evaluation(
+        failed_seeds=tuple(failed),
         safe_success_rate=None if safe is None else float(np.mean(safe)),
         episodes=len(returns),
         success_rate=None if successes is None else float(np.mean(successes)),
@@ -265,3 +280,32 @@ def _summary(
         std_return=float(np.std(returns)),
         mean_length=float(np.mean(lengths)),
     )
+
+
+def film_episode(policy: Policy, seed: int, path: Path) -> Path:
+    """Film an episode that a policy plays; return the path.
+
+    Args:
+        policy: The policy, whose environment is made for it.
+        seed: Seed of the reset.
+        path: The video (.mp4).
+
+    Raises:
+        MissingExtraError: If what encodes it is not installed.
+        StorageError: If it cannot be written.
+    """
+    from softmode.viz.film import Film
+
+    with Film(path) as film:
+        env = policy.make(render_mode="rgb_array")
+        try:
+            observation, _ = env.reset(seed=seed)
+            done = False
+            while not done:
+                observation, _, terminated, truncated, _ = env.step(policy(observation))
+                done = terminated or truncated
+                film.add(np.asarray(env.render()), env.metadata["render_fps"])
+        finally:
+            env.close()
+        film.publish()
+    return path

@@ -19,6 +19,11 @@ CONFIG, PROGRESS, LATEST, BEST = "config.json", "progress.csv", "latest.npz", "b
 """Names of the files of a run."""
 
 
+def checkpoint_in(path: Path, which: str = "best") -> Path:
+    """Return the best or latest checkpoint of a run's folder; of another path the path itself."""
+    return path / f"{which}.npz" if path.is_dir() else path
+
+
 class RunFolder:
     """A folder that one run writes to.
 

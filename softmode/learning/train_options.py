@@ -46,7 +46,12 @@ class RunOptions:
     nan_guard: bool = False
     """Check every observation and reward; dump the last steps of worlds that are not finite, and stop."""
     eval_episodes: int = 200
-    """Episodes of the evaluation at the end; none with 0."""
+    """Episodes of an evaluation; none with 0."""
+    eval_every: int = 0
+    """Iterations between two evaluations without noise, on seeds of their own, by which the best checkpoint is chosen;
+    with 0 the noisy episodes of training choose it."""
+    video_every: int = 0
+    """Evaluations from one film of a failed episode to the next; no films with 0."""
     checkpoint_seconds: float = 30.0
     """Seconds between two checkpoints."""
 
@@ -82,6 +87,12 @@ class TrainOptions(RunOptions):
         if self.time_limit is not None:
             require_number("time_limit", self.time_limit, above=0.0, unit="s", hint="give seconds like 300")
         require_number("eval_episodes", self.eval_episodes, at_least=0, hint="0 evaluates nothing")
+        require_number("eval_every", self.eval_every, at_least=0, hint="give a count of iterations like 20")
+        require_number("video_every", self.video_every, at_least=0, hint="give a count of evaluations like 5")
+        if self.eval_every and not self.eval_episodes:
+            raise ConfigError(f"eval_every is {self.eval_every} with no episodes", hint="give --eval-episodes too")
+        if self.video_every and not self.eval_every:
+            raise ConfigError(f"video_every is {self.video_every} without evaluations", hint="give --eval-every too")
         require_number("checkpoint_seconds", self.checkpoint_seconds, at_least=0.0, unit="s", hint="give seconds")
         if self.resume and self.run_dir is None:
             raise ConfigError("resume needs the folder of the run", hint="name it with --run-dir")

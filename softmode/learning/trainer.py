@@ -26,7 +26,7 @@ from softmode.learning.distributed import Ranks, local_device
 from softmode.learning.environments import make_vector_env
 from softmode.learning.nan_guard import NanGuard
 from softmode.learning.networks import Actor, ActorCritic
-from softmode.learning.policy import EVALUATION_SEED, Policy, actor_of, evaluate
+from softmode.learning.policy import EVALUATION_SEED, SELECTION_SEED, Policy, actor_of, evaluate, film_episode
 from softmode.learning.ppo import PPO, STATE
 from softmode.learning.rollout import Collector, Rollout
 from softmode.learning.run_folder import BEST, LATEST, RunFolder
@@ -63,7 +63,7 @@ def train(options: TrainOptions, *, make: MakeVectorEnv = make_vector_env, repor
             RunFolder(options.run_dir, resume=False)  # refuses, before the worlds are built
         worlds = make(options.env, options.num_envs, device, options.world_options())
         try:
-            run = _Run(options, TensorVectorEnv(worlds, device), ranks, start, report)
+            run = _Run(options, TensorVectorEnv(worlds, device), ranks, start, report, make)
             run.loop()
             return run.finish()
         finally:
@@ -109,18 +109,27 @@ class _Run:
     """The state of a run."""
 
     def __init__(
-        self, options: TrainOptions, env: TensorVectorEnv, ranks: Ranks, start: Checkpoint | None, report: Report
+        self,
+        options: TrainOptions,
+        env: TensorVectorEnv,
+        ranks: Ranks,
+        start: Checkpoint | None,
+        report: Report,
+        make: MakeVectorEnv,
     ) -> None:
+        self.make = make
         self.options, self.env, self.ranks, self.device = options, env, ranks, env.device
         self.report = report if ranks.rank == 0 else lambda line: None
         self.iteration = self.env_steps = self.resumed = 0
         self.seconds_before = 0.0
         self.best = (-sys.float_info.max, -sys.float_info.max)
+        self.evaluations, window = 0, []
         if start is not None and options.resume:
             progress = start.progress
             self.iteration, self.env_steps = int(progress["iteration"]), int(progress["env_steps"])
             self.seconds_before, self.resumed = float(progress["seconds"]), int(progress["resumed"]) + 1
             self.best = (float(progress["best_success"]), float(progress["best_return"]))
+            window = progress.get("window", [])
         worlds = options.num_envs * ranks.count
         self.hyperparameters = options.resolved(worlds)
         torch.manual_seed(options.seed)
@@ -134,7 +143,7 @@ class _Run:
             self._load(start)
         steps, discount = self.hyperparameters.rollout_steps, self.hyperparameters.discount
         self.collector = Collector(env, self.model, first, steps, discount)
-        self.log = TrainingLog(self.collector.statistics, self.ppo, ranks)
+        self.log = TrainingLog(self.collector.statistics, self.ppo, ranks, window)
         self.generator = torch.Generator(self.device)
         self.guard = NanGuard() if options.nan_guard else None
         self.warm_until = self.iteration + self._stagger_iterations(start is None)
@@ -303,8 +312,10 @@ class _Run:
             if self.ranks.rank == 0:
                 self.folder.log(row)
                 self.report(describe(row))
-                if progress >= 1.0 or now - saved >= self.options.checkpoint_seconds:
-                    better = self._is_best(row)
+                every = self.options.eval_every
+                due = every and (self.iteration % every == 0 or progress >= 1.0)
+                if due or progress >= 1.0 or now - saved >= self.options.checkpoint_seconds:
+                    better = self._evaluate() if due else not every and self._is_best(row)
                     self._save(self._checkpoint(), better)
                     saved = now
                 self._kept = self._checkpoint()
@@ -351,6 +362,30 @@ class _Run:
             self.best = score
         return better
 
+    def _evaluate(self) -> bool:
+        """Play episodes of which training knows nothing; return whether no checkpoint before was as good.
+
+        Of every `video_every`-th time the first episode that failed is filmed.
+        """
+        options, path = self.options, self.folder.path / LATEST
+        policy = Policy(self._checkpoint(), self.device, path)
+        worlds = self.make(
+            options.env, min(options.num_envs, options.eval_episodes), self.device, options.world_options()
+        )
+        try:
+            found = evaluate(worlds, policy, options.eval_episodes, seed=SELECTION_SEED, device=self.device)
+        finally:
+            worlds.close()
+        self.evaluations += 1
+        self.report(f"evaluation at iteration {self.iteration}, {found}")
+        if options.video_every and self.evaluations % options.video_every == 0 and found.failed_seeds:
+            seed = found.failed_seeds[0]
+            with self.folder.writing("film"):
+                self.report(f"wrote {film_episode(policy, seed, self.folder.path / f'failed-{self.iteration}-{seed}.mp4')}")
+        score = (-sys.float_info.max if found.success_rate is None else found.success_rate, found.mean_return)
+        better, self.best = score > self.best, max(score, self.best)
+        return better
+
     def _save(self, checkpoint: Checkpoint, better: bool = False) -> None:
         """Write the latest checkpoint, and the best where this is it or there is none."""
         for name in (LATEST, BEST) if better or not (self.folder.path / BEST).exists() else (LATEST,):
@@ -364,7 +399,7 @@ class _Run:
             arrays |= {f"{prefix}.{key}": value for key, value in module.state_dict().items()}
         arrays |= {f"optimizer.{key}": value for key, value in self.ppo.optimizer.state().items()}
         progress = {"iteration": self.iteration, "env_steps": self.env_steps, "seconds": self._seconds()}
-        progress |= {"seed": self.options.seed, "resumed": self.resumed}
+        progress |= {"seed": self.options.seed, "resumed": self.resumed, "window": list(self.log.window)}
         progress |= {"best_success": self.best[0], "best_return": self.best[1]}
         return Checkpoint(
             env=self.options.env,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable
 from typing import Any
 
 import torch
@@ -22,17 +23,20 @@ class TrainingLog:
         statistics: Of the episodes of this rank.
         ppo: The learner.
         ranks: The processes whose statistics are added up.
+        window: Sums over episodes of the iterations before this run went on, the oldest first.
     """
 
-    def __init__(self, statistics: EpisodeStatistics, ppo: PPO, ranks: Ranks) -> None:
-        """Start with no episode."""
+    def __init__(
+        self, statistics: EpisodeStatistics, ppo: PPO, ranks: Ranks, window: Iterable[list[float]] = ()
+    ) -> None:
+        """Start with the episodes of the window."""
         self.statistics, self.ppo, self.ranks = statistics, ppo, ranks
-        self._window: deque[list[float]] = deque()
+        self.window: deque[list[float]] = deque(window)
 
     @property
     def episodes(self) -> float:
         """Episodes that the current means are over."""
-        return sum(entry[0] for entry in self._window)
+        return sum(entry[0] for entry in self.window)
 
     def read(self, losses: torch.Tensor, bad: torch.Tensor, progress: float) -> tuple[dict[str, Any], float, bool]:
         """Wait for the device; return the iteration's row, the first rank's progress, whether any rank is bad.
@@ -52,10 +56,10 @@ class TrainingLog:
         episodes, total, length, success, valid = values[:5]
         term_sums = values[5 : 5 + len(names)]
         any_bad, skipped, progress = values[5 + len(names) : 8 + len(names)]
-        self._window.append([episodes, total, length, success])
-        while self.episodes - self._window[0][0] >= WINDOW:
-            self._window.popleft()
-        count, total, length, success = (sum(column) for column in zip(*self._window, strict=True))
+        self.window.append([episodes, total, length, success])
+        while self.episodes - self.window[0][0] >= WINDOW:
+            self.window.popleft()
+        count, total, length, success = (sum(column) for column in zip(*self.window, strict=True))
         row: dict[str, Any] = {
             "episodes": int(episodes),
             "return": total / count if count else None,

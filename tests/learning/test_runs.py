@@ -94,6 +94,49 @@ def test_resumption_goes_on_where_the_run_was(tmp_path: Path):
     assert seconds == sorted(seconds)
 
 
+def test_evaluations_choose_the_best(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """With `eval_every` the best is that of the evaluations, on seeds of their own, and failures are filmed.
+
+    What training itself counts goes on after a resumption: its last episodes are in the checkpoint.
+    """
+    from softmode.learning import trainer
+    from softmode.learning.policy import Evaluation, load_policy
+
+    scores, seeds, films = iter([0.2, 0.9, 0.5]), [], []
+
+    def evaluate(env, policy, episodes, *, seed, device):
+        """Return a made-up result."""
+        seeds.append((env.num_envs, episodes, seed))
+        numbers = {"mean_return": 0.0, "std_return": 0.0, "mean_length": 12.0, "failed_seeds": (seed + 3, seed + 5)}
+        return Evaluation(episodes=episodes, success_rate=next(scores), **numbers)
+
+    monkeypatch.setattr(trainer, "evaluate", evaluate)
+    monkeypatch.setattr(trainer, "film_episode", lambda policy, seed, path: films.append((seed, path.name)) or path)
+    folder, lines = tmp_path / "run", []
+    run(folder, 320, eval_every=2, eval_episodes=5, video_every=2, lines=lines, checkpoint_seconds=1e9)
+    assert seeds == [(5, 5, trainer.SELECTION_SEED)] * 3
+    best = read_checkpoint(folder / "best.npz").progress
+    assert best["iteration"] == 4 and best["best_success"] == 0.9
+    assert films == [(trainer.SELECTION_SEED + 3, "failed-4-1500000003.mp4")]
+    assert any("evaluation at iteration 4" in line for line in lines)
+    assert load_policy(folder).checkpoint.progress["iteration"] == 4
+    window = read_checkpoint(folder / "latest.npz").progress["window"]
+    assert sum(entry[0] for entry in window) > 0
+    monkeypatch.undo()
+    run(folder, 384, resume=True)
+    assert read_checkpoint(folder / "latest.npz").progress["window"][: len(window)] == window
+
+
+@pytest.mark.parametrize(
+    ("given", "named"),
+    [({"eval_every": 5, "eval_episodes": 0}, "no episodes"), ({"video_every": 5}, "without evaluations")],
+)
+def test_evaluations_without_episodes_are_refused(given: dict[str, int], named: str):
+    """The message names what is missing."""
+    with pytest.raises(ConfigError, match=named):
+        TrainOptions(env="Point", **given)
+
+
 TRAIN = ["train", "Pendulum-v1", "--num-envs", "2", "--eval-episodes", "0", "--set", "rollout_steps=32", "hidden=[8]"]
 
 
