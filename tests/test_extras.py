@@ -18,7 +18,18 @@ EXTRAS = set(PROJECT["optional-dependencies"])
 SOURCES = sorted((ROOT / "softmode").rglob("*.py"))
 
 OPTIONAL = (
-    *("torch", "tensorboard", "stable_baselines3", "rsl_rl", "skrl", "onnxruntime", "pyarrow", "imageio", "imageio_ffmpeg", "tyro"),
+    *(
+        "torch",
+        "tensorboard",
+        "stable_baselines3",
+        "rsl_rl",
+        "skrl",
+        "onnxruntime",
+        "pyarrow",
+        "imageio",
+        "imageio_ffmpeg",
+        "tyro",
+    ),
     *("pxr", "newton_usd_schemas", "rerun", "viser", "matplotlib", "mujoco_menagerie", "backports", "compression"),
 )
 """Modules that only extras bring; `compression` is where Python 3.14 keeps Zstandard."""

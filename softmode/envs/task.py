@@ -20,7 +20,7 @@ from softmode.deformables.model.structs import filled
 from softmode.deformables.reduction.build_body import Progress
 from softmode.envs import task_kernels as kernels
 from softmode.envs.cameras import overview, square_camera, wrist_camera
-from softmode.envs.disturbances import Disturbances, disturbance_parameters, disturbed, last_actions
+from softmode.envs.disturbances import Disturbances, disturbance_parameters, last_actions
 from softmode.envs.episodes import FALL, Episodes
 from softmode.envs.film import TaskFilm
 from softmode.envs.handling import Handling
@@ -173,12 +173,15 @@ class Task:
             self.rest_height, lowest = held.follow(heights), held.follow(heights - FALL)
             self.layout = _layout(self)
             self.segments, self.observation = self.layout.segments, self.layout.values
-            what = (config, scene, self.table, self.layout, limit)
-            self.disturbances = Disturbances(*what) if disturbed(config) else None
+            on = "action_delay" in self.table.parameters
+            self.disturbances = Disturbances(scene, self.table, self.layout, limit) if on else None
             sparse = config.reward_mode == "sparse" and not config.terms_follow_mode
             counts = {"terms": len(self.term_names), "metrics": len(self.metric_names)}
             self.episodes = Episodes(world_count, **counts, limit=limit, sparse=sparse, device=self.device)
             self.terms, self.metrics, self.success = self.episodes.terms, self.episodes.metrics, self.episodes.success
+            if config.care and "gentle" not in self.term_names:
+                hint = "leave it out, or take LiftSoft or PlaceInBin"
+                raise ConfigError(f"care is {config.care}: {type(self).__name__} has no term 'gentle'", hint=hint)
             self.handling = Handling(
                 scene,
                 self.table.column("friction"),

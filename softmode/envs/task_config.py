@@ -25,7 +25,7 @@ _RANGES: dict[str, dict[str, float]] = {
     "density_range": {"above": 0.0},
     "friction_range": {"at_least": 0.0},
     "scale_range": {"above": 0.49, "below": 2.01},
-    **{f"{name}_range": limits for name, limits in LIMITS.items()},
+    **{f"{name}_range": {"at_least": least, "at_most": most} for name, (least, most) in LIMITS.items()},
 }
 """Limits of the ranges that may be None."""
 

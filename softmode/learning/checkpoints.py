@@ -6,6 +6,7 @@ import dataclasses
 import os
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
@@ -97,14 +98,26 @@ def same_env(one: str, other: str) -> bool:
     return one.rpartition(":")[2] == other.rpartition(":")[2]
 
 
+def check_id(trained: str, path: object, env: str) -> None:
+    """Refuse a policy of another environment, or of another version of it.
+
+    Raises:
+        CheckpointError: If it is one.
+    """
+    if not same_env(trained, env):
+        there = trained.rpartition(":")[2] in gym.registry
+        hint = f"play {trained}" if there else f"train anew: this version of softmode has no {trained}"
+        raise CheckpointError(f"checkpoint {path} is of {trained}, not of {env}", hint=hint)
+
+
 def check_env(checkpoint: Checkpoint, path: object, env: str | None, interface: Interface) -> None:
     """Refuse a checkpoint of another environment or other spaces.
 
     Raises:
         CheckpointError: If it is one.
     """
-    if env is not None and not same_env(checkpoint.env, env):
-        raise CheckpointError(f"checkpoint {path} is of {checkpoint.env}, not of {env}", hint=f"play {checkpoint.env}")
+    if env is not None:
+        check_id(checkpoint.env, path, env)
     if checkpoint.interface != interface:
         raise CheckpointError(
             f"checkpoint {path} was trained with other spaces: {_describe(checkpoint.interface)}, "

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from softmode.errors import CheckpointError, ConfigError, needs_extra
+from softmode.errors import ConfigError, needs_extra
 from softmode.learning.run_folder import checkpoint_in
 
 if TYPE_CHECKING:
@@ -43,12 +43,11 @@ def trained_policy(name: str, env: str) -> Policy | None:
     if name in POLICIES:
         return None
     require_torch()
-    from softmode.learning.checkpoints import same_env
+    from softmode.learning.checkpoints import check_id
     from softmode.learning.policy import load_policy
 
     policy = load_policy(name)
-    if not same_env(policy.env, env):
-        raise CheckpointError(f"checkpoint {name} is of {policy.env}, not of {env}", hint=f"play {policy.env}")
+    check_id(policy.env, name, env)
     return policy
 
 

@@ -381,7 +381,9 @@ class _Run:
         if options.video_every and self.evaluations % options.video_every == 0 and found.failed_seeds:
             seed = found.failed_seeds[0]
             with self.folder.writing("film"):
-                self.report(f"wrote {film_episode(policy, seed, self.folder.path / f'failed-{self.iteration}-{seed}.mp4')}")
+                self.report(
+                    f"wrote {film_episode(policy, seed, self.folder.path / f'failed-{self.iteration}-{seed}.mp4')}"
+                )
         score = (-sys.float_info.max if found.success_rate is None else found.success_rate, found.mean_return)
         better, self.best = score > self.best, max(score, self.best)
         return better

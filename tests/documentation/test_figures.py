@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks import tasks
 from benchmarks.record import record
 from tests.documentation.pages import FENCE, ROOT
 
@@ -64,6 +65,15 @@ def test_marked_places_are_up_to_date(page: Path) -> None:
 def test_page_of_figures_is_up_to_date() -> None:
     """The page "Figures" is what docs/data says."""
     assert SOURCE["PAGE"].read_text() == SOURCE["page"](FIGURES), "run python docs/figures.py"
+
+
+def test_page_of_tasks_is_up_to_date() -> None:
+    """The page on tasks and methods is what docs/data/tasks.csv says; every cell has figures, a command or a reason."""
+    text = tasks.PAGE.read_text()
+    assert text == tasks.page(tasks.known()), "run python -m benchmarks.tasks"
+    assert sum(
+        line.count("`") >= 2 or "no " in line or "sparse" in line for line in text.splitlines() if "|" in line
+    ) == (len(tasks.METHODS) * len(tasks.IDS))
 
 
 def test_figures_say_where_they_come_from() -> None:

@@ -95,7 +95,13 @@ NAMES = ("observation_noise", "observation_bias")
 def test_drives_follow_their_parameters() -> None:
     """Half the effort presses with half the force; gain and dry friction are those of MuJoCo's drives; per world."""
     env = worlds_of(2, gain_range=(0.5, 1.0), drive_friction_range=(0.0, 0.1), effort_range=(0.5, 1.0))
-    given = {"position": (0.45, 0.0), "yaw": 0.0, "youngs_modulus": 1e6, "gain": (1.0, 0.5), "drive_friction": (0.0, 0.1)}
+    given = {
+        "position": (0.45, 0.0),
+        "yaw": 0.0,
+        "youngs_modulus": 1e6,
+        "gain": (1.0, 0.5),
+        "drive_friction": (0.0, 0.1),
+    }
     env.reset(seed=0, options={**given, "effort": (1.0, 1.0)})
     model = env.unwrapped.task.scene.solver.rigid.mjw_model
     gains, friction = model.actuator_gainprm.numpy()[:, :, 0], model.dof_frictionloss.numpy()
@@ -104,7 +110,10 @@ def test_drives_follow_their_parameters() -> None:
     np.testing.assert_allclose(np.sort(friction[1] - friction[0]), np.sort(0.1 * limits[0]), rtol=1e-5)
     given |= {"gain": (1.0, 1.0), "drive_friction": (0.0, 0.0)}
     env.reset(seed=0, options={**given, "effort": (1.0, 0.5)})
-    down, close = np.tile(np.array([0, 0, -1, 0, 1], np.float32), (2, 1)), np.tile(np.eye(5, dtype=np.float32)[4] * -1, (2, 1))
+    down, close = (
+        np.tile(np.array([0, 0, -1, 0, 1], np.float32), (2, 1)),
+        np.tile(np.eye(5, dtype=np.float32)[4] * -1, (2, 1)),
+    )
     for _ in range(9):
         env.step(down)
     for _ in range(30):

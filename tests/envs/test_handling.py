@@ -14,6 +14,7 @@ from softmode.envs.handling_kernels import DROP, LEAST_FORCE, MARGIN, principal_
 from softmode.envs.scripted import scripted_policy
 from softmode.envs.tasks.lift_soft.task import LiftSoftConfig, LiftSoftEnv
 from softmode.errors import ConfigError
+from tests.envs.conftest import MakeEnv
 
 DOWN = np.array([0.0, 0.0, -1.0, 0.0, -1.0], np.float32)
 
@@ -123,7 +124,29 @@ def test_a_success_beyond_the_limit_is_not_safe() -> None:
     assert [value for value, _ in safe] == [True, False] and safe[0][1] == safe[1][1] > 3.0
 
 
-@pytest.mark.parametrize("given", [{"force_limit": 0.0}, {"strain_limit": -0.1}])
+def test_care_costs_what_the_peaks_rise_by(make_env: MakeEnv, lift: LiftSoftEnv) -> None:
+    """The sum of `gentle` is -care log(max(2 u, 1)), u the greater of the peaks relative to their limits, once a blow.
+
+    Without care it is zero, and tasks without the term refuse it.
+    """
+    care = 4.0
+    env: Any = make_env("LiftSoft", care=care).unwrapped
+    for task in (env, lift):
+        total, costly = 0.0, 0
+        task.reset(seed=0, options={"position": (0.45, 0.0), "youngs_modulus": 1.0e6})
+        for k in range(40):
+            *_, info = task.step(DOWN if k < 25 else np.array([0.0, 0.0, 1.0, 0.0, -1.0], np.float32))
+            assert info["reward_terms"]["gentle"] <= 0.0
+            total, costly = total + info["reward_terms"]["gentle"], costly + (info["reward_terms"]["gentle"] < 0.0)
+        used = max(info["peak_force"] / task.task.handling.force_limit.numpy()[0], info["peak_strain"] / 0.3)
+        weight = care if task is env else 0.0
+        assert total == pytest.approx(-weight * np.log(2.0 * used), rel=1e-4) and used > 1.0
+        assert costly < 25
+    with pytest.raises(ConfigError, match="PressSoft has no term 'gentle'"):
+        gym.make("softmode/PressSoft-v0", care=1.0)
+
+
+@pytest.mark.parametrize("given", [{"force_limit": 0.0}, {"care": -1.0}, {"strain_limit": -0.1}])
 def test_limits_that_cannot_be_are_refused(given: dict[str, float]) -> None:
     """A limit is above zero and a share between 0 and 1; the message names it."""
     with pytest.raises(ConfigError, match=next(iter(given))):

@@ -102,9 +102,9 @@ def test_evaluations_choose_the_best(tmp_path: Path, monkeypatch: pytest.MonkeyP
     from softmode.learning import trainer
     from softmode.learning.policy import Evaluation, load_policy
 
-    scores, seeds, films = iter([0.2, 0.9, 0.5]), [], []
+    scores, seeds, films = iter([0.2, 0.9, 0.5, 1.0]), [], []
 
-    def evaluate(env, policy, episodes, *, seed, device):
+    def evaluate(env, policy, episodes, *, seed=trainer.EVALUATION_SEED, device):
         """Return a made-up result."""
         seeds.append((env.num_envs, episodes, seed))
         numbers = {"mean_return": 0.0, "std_return": 0.0, "mean_length": 12.0, "failed_seeds": (seed + 3, seed + 5)}
@@ -114,7 +114,7 @@ def test_evaluations_choose_the_best(tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(trainer, "film_episode", lambda policy, seed, path: films.append((seed, path.name)) or path)
     folder, lines = tmp_path / "run", []
     run(folder, 320, eval_every=2, eval_episodes=5, video_every=2, lines=lines, checkpoint_seconds=1e9)
-    assert seeds == [(5, 5, trainer.SELECTION_SEED)] * 3
+    assert seeds == [(5, 5, trainer.SELECTION_SEED)] * 3 + [(8, 5, trainer.EVALUATION_SEED)]
     best = read_checkpoint(folder / "best.npz").progress
     assert best["iteration"] == 4 and best["best_success"] == 0.9
     assert films == [(trainer.SELECTION_SEED + 3, "failed-4-1500000003.mp4")]

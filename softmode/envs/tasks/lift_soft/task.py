@@ -75,7 +75,8 @@ class LiftSoft(Task):
 
     Reward terms: ``reach`` (0..1, tool to object), ``grasp`` (0 or 0.5, both fingers touch), ``lift`` (0..1, share of
     the goal's height while grasped), ``goal`` (0..2, nearness to the goal while lifted), ``hold`` (0 or 2, at the
-    goal). Success: at the goal, held by both fingers, for ``hold_steps`` steps in a row.
+    goal), ``gentle`` (at most 0, see `TaskConfig.care`). Success: at the goal, held by both fingers, for
+    ``hold_steps`` steps in a row.
     """
 
     config: LiftSoftConfig

@@ -164,7 +164,8 @@ class PlaceInBin(Task):
 
     Reward terms: ``reach`` (0..1, tool to toy), ``grasp`` (0 or 0.5, both fingers hold it), ``carry`` (0..3, how little
     of the way up, across and down is left while it is held), ``release`` (0..2, in or over the bin, how little the
-    fingers squeeze), ``rest`` (0 or 2, no finger touches anything, at rest, all other objects in the bin). What is in
+    fingers squeeze), ``rest`` (0 or 2, no finger touches anything, at rest, all other objects in the bin),
+    ``gentle`` (at most 0, see `TaskConfig.care`). What is in
     or over the bin keeps ``reach`` and ``grasp``, held or not. Success: ``rest`` for ``hold_steps`` steps in a row.
     Failure: ``spilled``, another object is outside the bin's walls.
 

@@ -1,0 +1,149 @@
+"""Tasks against methods: how often each succeeds, and how gently; the page docs/benchmark_tasks.md.
+
+Run: ``python -m benchmarks.tasks`` writes the page from docs/data/tasks.csv. ``python -m benchmarks.tasks scripted
+LiftSoft --episodes 50`` plays a cell and adds its row. In place of ``scripted`` it takes the file of a policy, with
+``--method``, ``--steps``, ``--seconds``, ``--seed`` and ``--machine`` of its training.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+import softmode
+from softmode.learning.intervals import wilson_interval
+
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+DATA, PAGE = DOCS / "data" / "tasks.csv", DOCS / "benchmark_tasks.md"
+IDS = {name.partition("/")[2].rpartition("-")[0]: name for name in softmode.ENVIRONMENTS}
+METHODS = ("scripted", "PPO", "PPO from pictures", "SAC with HER", "behaviour cloning", "MPC")
+COLUMNS = (
+    *("task", "method", "seed", "episodes", "successes", "safe", "steps", "seconds", "machine", "commit", "command"),
+)
+SECONDS = {"PlaceInBin": 300, "RopeRoute": 290, "LiftSoft": 170}
+"""Seconds of training where they are not 120."""
+PREAMBLE = """# Tasks and methods
+
+How often a method succeeds in a task, with its 95 % interval (Wilson), and how often it does so within the
+[limits of force and strain](environments.md#gentle-hands). Episodes are whole ones on seeds that training does not use,
+in the task's default ranges; policies act without noise. Steps and time are those of the training. What was not run is
+empty and has its command; what does not apply has the reason. A policy's range is measured by
+`python -m benchmarks.robustness policies/lift_soft.npz`.
+
+This page is written by `python -m benchmarks.tasks` from `docs/data/tasks.csv`.
+"""
+
+
+def cell(task: str, method: str) -> tuple[str, str]:
+    """Return the command of a cell that was not run, or an empty one and why there is none."""
+    env, goals = IDS[task], task.endswith("Goal")
+    train = (
+        f"softmode train {env} --device cuda:0 --num-envs 4096 --time-limit {SECONDS.get(task, 120)} --eval-every 20"
+    )
+    pictures = """ --obs-type pixels_agent_pos --env-options '{"config": {"image_size": 64}}'"""
+    if method == "scripted":
+        return f"python -m benchmarks.tasks scripted {task} --episodes 50", ""
+    if method.startswith("PPO"):
+        return ("", "rewards are sparse") if goals else (train + pictures * ("pictures" in method), "")
+    if method == "SAC with HER":
+        return (f"python examples/train_sb3.py --env {env}", "") if goals else ("", "observations have no goal")
+    if method == "behaviour cloning":
+        return ("python examples/behaviour_cloning.py", "") if task == "PushSoft" else ("", "no example yet")
+    return ("python examples/mpc_push.py", "") if task == "PushSoft" else ("", "no example yet")
+
+
+def known() -> list[dict[str, str]]:
+    """Return the rows that were measured."""
+    with DATA.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def page(rows: list[dict[str, str]]) -> str:
+    """Return the page."""
+    text = PREAMBLE
+    for task in IDS:
+        text += (
+            f"\n## {task}\n\n| method | seed | success | safe success | steps | time | machine, commit | command |\n"
+        )
+        text += "|---|---|---|---|---|---|---|---|\n"
+        for method in METHODS:
+            found = [row for row in rows if (row["task"], row["method"]) == (task, method)]
+            for row in found:
+                low, high = wilson_interval(float(row["successes"]), int(row["episodes"]))
+                of = row["episodes"]
+                success = f"{row['successes']} of {of} ({100 * low:.0f} to {100 * high:.0f} %)"
+                safe = f"{row['safe']} of {of}" if row["safe"] else ""
+                time = f"{float(row['seconds']):.0f} s" if row["seconds"] else ""
+                steps = f"{int(row['steps']):,}" if row["steps"] else ""
+                cells = (method, row["seed"], success, safe, steps, time, f"{row['machine']}, {row['commit']}")
+                text += f"| {' | '.join(cells)} | `{row['command']}` |\n"
+            if not found:
+                command, reason = cell(task, method)
+                text += f"| {method} | | {reason or 'not run'} | | | | | {f'`{command}`' if command else ''} |\n"
+    return text
+
+
+def play(task: str, policy: str, episodes: int, seed: int, device: str | None) -> tuple[int, int]:
+    """Return in how many episodes a policy succeeded, and in how many safely."""
+    from softmode.envs import scripted_worlds
+    from softmode.learning.policy import load_policy
+
+    trained = None if policy == "scripted" else load_policy(policy)
+    options: dict[str, Any] = {} if trained is None else trained.env_options
+    env: Any = gym.make_vec(IDS[task], num_envs=episodes, autoreset_mode="Disabled", device=device, **options)
+    player: Any = scripted_worlds(env) if trained is None else trained
+    observation, _ = env.reset(seed=seed)
+    alive, found = np.ones(episodes, bool), np.zeros((2, episodes), bool)
+    while alive.any():
+        observation, _, terminated, truncated, infos = env.step(player(observation))
+        ended = alive & (terminated | truncated)
+        for k, name in enumerate(("is_success", "is_safe_success")):
+            found[k, ended] = infos[name][ended]
+        alive &= ~ended
+    env.close()
+    return int(found[0].sum()), int(found[1].sum())
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Play a cell, if one is given, and write the page."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("policy", nargs="?", help="scripted, or the file of a policy")
+    parser.add_argument("task", nargs="?", choices=tuple(IDS))
+    parser.add_argument("--method", choices=METHODS)
+    parser.add_argument("--episodes", type=int, default=50)
+    parser.add_argument("--first-seed", type=int, default=1_000_000_000)
+    parser.add_argument("--device")
+    for name in ("seed", "steps", "seconds", "command"):
+        parser.add_argument(f"--{name}", default="")
+    parser.add_argument("--machine", default="one core")
+    args = parser.parse_args(arguments)
+    if args.policy and not (args.task and (args.method or args.policy == "scripted")):
+        parser.error("give the task, and --method with the file of a policy")
+    rows = known()
+    if args.policy:
+        method = args.method or "scripted"
+        won, safe = play(args.task, args.policy, args.episodes, args.first_seed, args.device)
+        commit = subprocess.run(
+            ["git", "rev-parse", "--short=7", "HEAD"], capture_output=True, text=True
+        ).stdout.strip()
+        told = {**vars(args), "method": method, "successes": won, "safe": safe, "commit": commit}
+        told["command"] = args.command or cell(args.task, method)[0]
+        print(f"{args.task}, {method}: {won} of {args.episodes}, {safe} safely")
+        key = (args.task, method, args.seed)
+        rows = [row for row in rows if (row["task"], row["method"], row["seed"]) != key]
+        rows.append({name: str(told[name]) for name in COLUMNS})
+        with DATA.open("w", newline="") as file:
+            writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)
+    PAGE.write_text(page(rows))
+
+
+if __name__ == "__main__":
+    main()
