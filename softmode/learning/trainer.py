@@ -70,6 +70,8 @@ def train(options: TrainOptions, *, make: MakeVectorEnv = make_vector_env, repor
             worlds.close()
             if run is not None:
                 run.folder.close()
+                if run.judges is not None:
+                    run.judges.close()
     finally:
         ranks.stop()
 
@@ -117,7 +119,7 @@ class _Run:
         report: Report,
         make: MakeVectorEnv,
     ) -> None:
-        self.make = make
+        self.make, self.judges = make, None
         self.options, self.env, self.ranks, self.device = options, env, ranks, env.device
         self.report = report if ranks.rank == 0 else lambda line: None
         self.iteration = self.env_steps = self.resumed = 0
@@ -369,13 +371,10 @@ class _Run:
         """
         options, path = self.options, self.folder.path / LATEST
         policy = Policy(self._checkpoint(), self.device, path)
-        worlds = self.make(
-            options.env, min(options.num_envs, options.eval_episodes), self.device, options.world_options()
-        )
-        try:
-            found = evaluate(worlds, policy, options.eval_episodes, seed=SELECTION_SEED, device=self.device)
-        finally:
-            worlds.close()
+        if self.judges is None:
+            count = min(options.num_envs, max(options.eval_episodes, options.processes))
+            self.judges = self.make(options.env, count, self.device, options.world_options())
+        found = evaluate(self.judges, policy, options.eval_episodes, seed=SELECTION_SEED, device=self.device)
         self.evaluations += 1
         self.report(f"evaluation at iteration {self.iteration}, {found}")
         if options.video_every and self.evaluations % options.video_every == 0 and found.failed_seeds:
