@@ -54,7 +54,7 @@ def cell(task: str, method: str) -> tuple[str, str]:
     if method == "SAC with HER":
         return (f"python examples/train_sb3.py --env {env}", "") if goals else ("", "observations have no goal")
     if method == "behaviour cloning":
-        return ("python examples/behaviour_cloning.py", "") if task == "PushSoft" else ("", "no example yet")
+        return f"python examples/behaviour_cloning.py --env {env}", ""
     return ("python examples/mpc_push.py", "") if task == "PushSoft" else ("", "no example yet")
 
 
@@ -91,13 +91,13 @@ def page(rows: list[dict[str, str]]) -> str:
 
 def play(task: str, policy: str, episodes: int, seed: int, device: str | None) -> tuple[int, int]:
     """Return in how many episodes a policy succeeded, and in how many safely."""
-    from softmode.envs import scripted_worlds
+    from softmode.envs import scripted_policy
     from softmode.learning.policy import load_policy
 
     trained = None if policy == "scripted" else load_policy(policy)
     options: dict[str, Any] = {} if trained is None else trained.env_options
     env: Any = gym.make_vec(IDS[task], num_envs=episodes, autoreset_mode="Disabled", device=device, **options)
-    player: Any = scripted_worlds(env) if trained is None else trained
+    player: Any = scripted_policy(env) if trained is None else trained
     observation, _ = env.reset(seed=seed)
     alive, found = np.ones(episodes, bool), np.zeros((2, episodes), bool)
     while alive.any():
