@@ -64,7 +64,8 @@ def play(env: Any, policy: Policy, options: Mapping[str, Any], seed: int) -> dic
     count, segments = env.num_envs, env.unwrapped.task.segments
     random = np.random.default_rng(seed)
     given = {
-        name: random.uniform(*value, count) if isinstance(value, tuple) else value for name, value in options.items()
+        name: random.uniform(value[0], value[1], count) if isinstance(value, tuple) else value
+        for name, value in options.items()
     }
     given = {**{name: neutral(name) for name in LIMITS}, **given}
     observation, _ = env.reset(seed=seed, options=given)

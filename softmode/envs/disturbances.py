@@ -25,7 +25,7 @@ LIMITS = {
     "drive_friction": (0.0, 0.9),
     "effort": (0.05, 10.0),
 }
-"""What the ranges of the disturbances may hold, by the names of the parameters, in the order of `kernels.Disturbed`."""
+"""What the ranges of the disturbances may hold, by the names of the parameters, in the order of `Disturbed`."""
 SIM_TO_REAL: dict[str, Any] = {
     "action_delay_range": (0.0, 2.0),
     "observation_delay_range": (0.0, 1.0),

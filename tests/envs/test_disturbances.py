@@ -72,7 +72,8 @@ def test_noise_and_bias_have_their_size_and_repeat() -> None:
     def far(noise: float, bias: float, seed: int = 3) -> np.ndarray:
         """Return how far off every number is in 40 steps, shape (40, worlds, D)."""
         rows = []
-        for given in ({"observation_noise": noise, "observation_bias": bias}, dict.fromkeys(NAMES, 0.0)):
+        for sizes in ((noise, bias), (0.0, 0.0)):
+            given = dict(zip(NAMES, sizes, strict=True))
             env.reset(seed=seed, options={"position": (0.45, 0.0), "yaw": 0.0, **given})
             rows.append([env.step(zero)[0].copy() for _ in range(40)])
         return np.subtract(*rows)

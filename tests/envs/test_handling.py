@@ -14,7 +14,6 @@ from softmode.envs.handling_kernels import DROP, LEAST_FORCE, MARGIN, principal_
 from softmode.envs.scripted import scripted_policy
 from softmode.envs.tasks.lift_soft.task import LiftSoftConfig, LiftSoftEnv
 from softmode.errors import ConfigError
-from tests.envs.conftest import MakeEnv
 
 DOWN = np.array([0.0, 0.0, -1.0, 0.0, -1.0], np.float32)
 
@@ -124,13 +123,13 @@ def test_a_success_beyond_the_limit_is_not_safe() -> None:
     assert [value for value, _ in safe] == [True, False] and safe[0][1] == safe[1][1] > 3.0
 
 
-def test_care_costs_what_the_peaks_rise_by(make_env: MakeEnv, lift: LiftSoftEnv) -> None:
+def test_care_costs_what_the_peaks_rise_by(lift: LiftSoftEnv) -> None:
     """The sum of `gentle` is -care log(max(2 u, 1)), u the greater of the peaks relative to their limits, once a blow.
 
     Without care it is zero, and tasks without the term refuse it.
     """
     care = 4.0
-    env: Any = make_env("LiftSoft", care=care).unwrapped
+    env = LiftSoftEnv(care=care)
     for task in (env, lift):
         total, costly = 0.0, 0
         task.reset(seed=0, options={"position": (0.45, 0.0), "youngs_modulus": 1.0e6})
@@ -142,6 +141,7 @@ def test_care_costs_what_the_peaks_rise_by(make_env: MakeEnv, lift: LiftSoftEnv)
         weight = care if task is env else 0.0
         assert total == pytest.approx(-weight * np.log(2.0 * used), rel=1e-4) and used > 1.0
         assert costly < 25
+    env.close()
     with pytest.raises(ConfigError, match="PressSoft has no term 'gentle'"):
         gym.make("softmode/PressSoft-v0", care=1.0)
 

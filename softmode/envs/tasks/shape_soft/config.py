@@ -52,6 +52,8 @@ class ShapeSoftConfig(TaskConfig):
     """Half-width of the post's random position in x and y [m]."""
     youngs_modulus_range: tuple[float, float] | None = (5.0e4, 1.0e6)
     """Range of the random Young's modulus [Pa], log-uniform; None keeps the scene's material."""
+    strain_limit: float = 0.6
+    """Largest principal strain of a safe success; bending the post to its goal takes up to 0.5."""
     goal_displacement: tuple[float, float] = (0.025, 0.06)
     """Range of the displacement of the free end in the target shape [m]."""
     goal_direction: tuple[float, float] = (-np.pi, np.pi)
