@@ -19,17 +19,17 @@ from softmode.deformables.reduction.elastic_functions import (
     SPACE_ERROR,
     SPACE_MODE_COUNTS,
     TURN_COUNT,
+    ElasticChoice,
     Held,
     choose_functions,
 )
 from softmode.deformables.reduction.functions import (
     HELD_RANK_TOLERANCE,
-    TRACE_TOLERANCE,
     Functions,
     affine_first,
     driven_first,
-    orthonormal_in_mass,
     orthonormalise,
+    split_at_regions,
 )
 from softmode.deformables.reduction.galerkin import mass_matrix
 from softmode.deformables.reduction.kernel_visibility import Material, divide_at_gaps
@@ -289,24 +289,16 @@ def _quadratic_basis(domain: Domain, options: BuildOptions, stage: Callable[[str
     raw, raw_gradient = QuadraticFunctions(kernels=kernels, length=domain.length).evaluate(domain.points)
     total, every = domain.volumes.sum(), np.arange(raw.shape[1])
     fields = raw, raw_gradient, domain.volumes * domain.density / total, domain.volumes * domain.stiffness / total
+    lead, none, others = np.eye(raw.shape[1])[:, [3, 0, 1, 2]], every[:0], every[4:]
+    report: dict[str, float] = {}
     if options.chosen:
-        choice = choose_functions(
-            *fields,
-            lead=np.eye(raw.shape[1])[:, [3, 0, 1, 2]],
-            kept=every[:0],
-            others=every[4:],
-            half=None,
-            quadratic=every[:10],
-            held=None,
-            count=options.function_count,
-            accuracy=options.accuracy,
-            poissons_ratios=options.poissons_ratios,
-        )
-        found, report = affine_first(choice.transform, every[:4], domain.length), choice.report()
+        quadratic = every[:10]
+        choice = choose_functions(*fields, lead=lead, kept=none, others=others, options=options, quadratic=quadratic)
+        transform, report = choice.transform, choice.report()
     else:
-        tolerance = min(options.rank_tolerance, HELD_RANK_TOLERANCE)
-        found = orthonormalise(*fields, leading=every[:4], length=domain.length, rank_tolerance=tolerance)
-        report = {}
+        tolerance = _rank_tolerance(domain, options)
+        transform = orthonormalise(*fields, lead=lead, kept=none, others=others, rank_tolerance=tolerance)
+    found = affine_first(transform, every[:4], domain.length)
     skin = constant_handle(len(kernels.centres))
     basis = _finished(kernels, skin, np.zeros(1), found, raw_gradient, None, domain, report)
     stage("functions")
@@ -341,22 +333,23 @@ def _basis(
 
     trace = None if envelope is None else at_regions(samples.exact)
     fields = raw, raw_gradient, domain.volumes * domain.density / total, domain.volumes * domain.stiffness / total
-    if not options.chosen:
-        found, report = (
-            orthonormalise(
-                *fields,
-                leading=skin.leading,
-                length=domain.length,
-                kept=skin.translating,
-                held=bool(domain.regions or options.local),
-                rank_tolerance=options.rank_tolerance,
-                trace=trace,
-            ),
-            {},
-        )
-    else:
+    leading = np.concatenate([skin.leading[[3, 0, 1, 2]], skin.leading[4:]])  # 1 first: then only it has a mean.
+    lead, driven = np.eye(raw.shape[1])[:, leading], np.zeros((raw.shape[1], 0))
+    if trace is not None:
+        lead, driven = split_at_regions(lead, raw, fields[2], trace)
+    report: dict[str, float] = {}
+    if options.chosen:
         springs_at = np.sqrt(_strength(domain) / total)[:, None] * at_regions(~samples.exact)
-        found, report = _chosen(fields, skin, modes, domain, options, trace, springs_at, quadratic)
+        choice = _chosen(fields, skin, modes, domain, options, lead, driven, trace, springs_at, quadratic)
+        transform, report = choice.transform, choice.report()
+    else:
+        kept, others = np.flatnonzero(skin.translating), np.setdiff1d(np.flatnonzero(~skin.translating), leading)
+        tolerance = _rank_tolerance(domain, options)
+        transform = orthonormalise(*fields, lead=lead, kept=kept, others=others, rank_tolerance=tolerance)
+    if trace is None:
+        found = affine_first(transform, skin.leading, domain.length)
+    else:
+        found = driven_first(driven, transform, raw, fields[2], skin.leading, domain.length)
     basis = _finished(kernels, skin, modes.eigenvalues, found, raw_gradient, trace, domain, report)
     stage("functions")
     return basis
@@ -368,11 +361,13 @@ def _chosen(
     modes: Eigenmodes,
     domain: Domain,
     options: BuildOptions,
+    lead: Array,
+    driven: Array,
     trace: Array | None,
     springs: Array,
     quadratic: int | None,
-) -> tuple[Functions, dict[str, float]]:
-    """Return functions chosen by elastic energy, those of exact regions first, and what the choice says of itself.
+) -> ElasticChoice:
+    """Return functions chosen by elastic energy, those that carry exact regions apart.
 
     Args:
         fields: Raw functions (P, R), their gradients [1/m] (P, R, 3), fractions of mass (P,), of stiffness (P,).
@@ -380,22 +375,17 @@ def _chosen(
         modes: Eigenmodes and local handles, which are among them after the constant handle and the regions.
         domain: What the body is.
         options: How many functions, and for which Poisson's ratios.
+        lead: Functions = raw @ lead of affine motion that come first, shape (R, f).
+        driven: Those that carry exact regions, shape (R, r).
         trace: Raw functions at points that fill the exact regions, (T, R); None without such regions.
         springs: Raw functions at points of soft regions, times the root of their springs per E and volume, (S, R).
         quadratic: Beyond so many the eigenmodes carry affine motion alone; None: they do not.
     """
-    raw, _, mass, _ = fields
-    leading = np.concatenate([skin.leading[[3, 0, 1, 2]], skin.leading[4:]])  # 1 first: then only it has a mean.
-    lead, driven = np.eye(raw.shape[1])[:, leading], np.zeros((raw.shape[1], 0))
     motions = np.zeros((0, 0))
     if trace is not None:
-        lead = orthonormal_in_mass(lead, raw, mass)
-        size, across = np.linalg.svd(np.linalg.qr(trace @ lead, mode="r"))[1:]
-        count = int((size > TRACE_TOLERANCE * size[0]).sum())
-        lead, driven = lead @ across[count:].T, lead @ across[:count].T
         motions = rigid_motions(domain.samples, trace @ driven, len(domain.regions))
     soft = (skin.owner > 0) & (skin.owner < len(domain.regions))
-    others = np.setdiff1d(np.flatnonzero(~soft), leading)
+    others = np.setdiff1d(np.flatnonzero(~soft), skin.leading)
     first_mode, mode_count = max(1, len(domain.regions)), len(modes.eigenvalues) - 1 - modes.local_count
     turned, level = np.zeros(0, dtype=np.intp), np.zeros(0)
     if motions.shape[1] and not options.local:
@@ -404,23 +394,18 @@ def _chosen(
         )
         level = np.sqrt(modes.eigenvalues[1] / modes.eigenvalues[1 + skin.owner[turned] - first_mode])
     late = (skin.owner >= first_mode + (quadratic or mode_count // 2)) & (skin.owner < first_mode + mode_count)
-    chosen = choose_functions(
+    return choose_functions(
         *fields,
         lead=lead,
-        kept=np.setdiff1d(np.flatnonzero(soft), leading),
+        kept=np.setdiff1d(np.flatnonzero(soft), skin.leading),
         others=others,
+        options=options,
         half=None if options.local else others[~late[others]],
         quadratic=np.arange(10) if trace is None else None,
         held=Held(driven=driven, motions=motions, springs=springs, turned=turned, level=level)
         if domain.regions
         else None,
-        count=options.function_count,
-        accuracy=options.accuracy,
-        poissons_ratios=options.poissons_ratios,
     )
-    if trace is None:
-        return affine_first(chosen.transform, skin.leading, domain.length), chosen.report()
-    return driven_first(driven, chosen.transform, raw, mass, skin.leading, domain.length), chosen.report()
 
 
 def _finished(
@@ -459,6 +444,11 @@ def _finished(
         envelope_length=0.0 if envelope is None else envelope.length,
         report=report,
     )
+
+
+def _rank_tolerance(domain: Domain, options: BuildOptions) -> float:
+    """Return which directions of FreeForm's functions are dropped: fewer on a body with regions, or local handles."""
+    return min(options.rank_tolerance, HELD_RANK_TOLERANCE if domain.regions or options.local else np.inf)
 
 
 def _mean_ratio(options: BuildOptions) -> float:

@@ -36,8 +36,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from softmode.deformables.reduction.functions import KEPT_TOLERANCE, orthonormal_in_mass
-from softmode.deformables.reduction.options import FUNCTION_COUNT, FUNCTION_LEAST, FUNCTION_LIMIT
+from softmode.deformables.reduction.functions import KEPT_TOLERANCE, independent, orthonormal_in_mass
+from softmode.deformables.reduction.options import FUNCTION_COUNT, FUNCTION_LEAST, FUNCTION_LIMIT, BuildOptions
 from softmode.deformables.reduction.reduced_stiffness import elastic_stiffness
 from softmode.deformables.reduction.static_response import lame_parameters, second_order_load
 from softmode.errors import BasisError, ConfigError
@@ -150,12 +150,10 @@ def choose_functions(
     lead: Array,
     kept: NDArray[np.intp],
     others: NDArray[np.intp],
-    half: NDArray[np.intp] | None,
-    quadratic: NDArray[np.intp] | None,
-    held: Held | None,
-    count: int | None,
-    accuracy: float | None,
-    poissons_ratios: tuple[float, ...],
+    options: BuildOptions,
+    half: NDArray[np.intp] | None = None,
+    quadratic: NDArray[np.intp] | None = None,
+    held: Held | None = None,
 ) -> ElasticChoice:
     """Choose functions by elastic energy.
 
@@ -167,12 +165,10 @@ def choose_functions(
         lead: Functions = raw @ lead that come first, shape (R, f): 1, x, y, z of a body without exact regions.
         kept: Raw functions that come next: affine motions of soft regions.
         others: Raw functions that the rest is chosen from. On a body with exact regions all of these vanish there.
+        options: How many functions, all that come first among them, or how accurate; and for which Poisson's ratios.
         half: The others without those that the second half of the eigenmodes makes; None without eigenmodes.
         quadratic: The ten raw functions x, y, z, 1, xx, ..., zx; None on a body with exact regions.
         held: What regions ask for; None for a body without regions.
-        count: Number of functions, all that come first among them; None for 48, or for as many as `accuracy` takes.
-        accuracy: Largest relative error of the first six frequencies, or None.
-        poissons_ratios: The body's own, or several.
 
     Warns:
         RuntimeWarning: If there are fewer functions than asked for, which begins at about 130.
@@ -181,6 +177,7 @@ def choose_functions(
         ConfigError: If the accuracy is not reached within 120 functions, or the regions alone need more than `count`.
         BasisError: If the elastic stiffness is singular.
     """
+    count, accuracy = options.function_count, options.accuracy
     space = _ElasticSpace(raw, raw_gradient, mass, stiff, lead, kept, others, held)
     fields = None if quadratic is None else space.transform.T @ (raw.T @ (mass[:, None] * raw[:, quadratic]))
     driven = 0 if held is None else held.driven.shape[1]
@@ -191,7 +188,7 @@ def choose_functions(
             f"function_count: {most} asked for, affine motions of the body and its regions are {least}",
             hint=f"give {least + FUNCTION_LEAST} or more",
         )
-    order, shares, modes = space.order(fields, poissons_ratios, min(most - driven, space.count))
+    order, shares, modes = space.order(fields, options.poissons_ratios, min(most - driven, space.count))
     chosen = order.shape[1]
     error = space.frequency_error(order, modes)
     smaller = None if half is None else space.spanned(raw.T @ (mass[:, None] * raw[:, half]))
@@ -246,41 +243,11 @@ class _ElasticSpace:
         others: NDArray[np.intp],
         held: Held | None,
     ) -> None:
-        weighted = raw * np.sqrt(mass)[:, None]
-        scale = 1.0 / np.maximum(np.linalg.norm(weighted, axis=0), 1e-300)
-        weighted *= scale
-        lead = lead / scale[:, None]
-        lead /= np.abs(lead).max(axis=0)
-        value, upper = np.linalg.qr(weighted @ lead)
-        sign = np.sign(np.diag(upper))
-        value *= sign
-        transform = lead @ np.linalg.inv(upper * sign[:, None])
-        counts = [lead.shape[1]]
-        for index, tolerance in (
-            (kept, KEPT_TOLERANCE),
-            (others, SPACE_TOLERANCE if held is None else HELD_SPACE_TOLERANCE),
-        ):
-            if not len(index):
-                counts.append(counts[-1])
-                continue
-            rest, content = weighted[:, index], np.zeros((value.shape[1], len(index)))
-            for _ in range(2):
-                found = value.T @ rest
-                rest -= value @ found
-                content += found
-            size, vector = linalg.eigh(rest.T @ rest, check_finite=False)
-            keep = size > tolerance * size[-1]
-            turn = vector[:, keep] / np.sqrt(size[keep])
-            part = np.zeros((raw.shape[1], turn.shape[1]))
-            part[index] = turn
-            transform = np.concatenate([transform, part - transform @ (content @ turn)], axis=1)
-            counts.append(transform.shape[1])
-            if index is kept:  # What comes after must be apart from these.
-                value = np.concatenate([value, rest @ turn], axis=1)
-        self.fixed, self.count = counts[1:]
-        """How many functions come first in any case, and how many there are."""
-        self.transform = transform * scale[:, None]
-        """Functions = raw @ transform, shape (R, V)."""
+        tolerance = SPACE_TOLERANCE if held is None else HELD_SPACE_TOLERANCE
+        self.transform, (self.fixed, self.count) = independent(
+            raw, mass, lead, [(kept, KEPT_TOLERANCE), (others, tolerance)]
+        )
+        """Functions = raw @ transform, shape (R, V); how many come first in any case, and how many there are."""
         every = self.transform if held is None else np.concatenate([self.transform, held.driven], axis=1)
         root = np.sqrt(stiff)[:, None]
         slopes = [raw_gradient[:, :, d] * root for d in range(3)]
