@@ -49,8 +49,24 @@ SPACE_MODE_COUNTS = 48, 96
 too stiff with 48 and 1.5 % with 96, for three times the time."""
 SPACE_ERROR = 0.02
 """The space is made larger where its second half lowers one of the first six frequencies by more than this."""
-SPACE_WARNING = 0.05
-"""A build says so where the space is not settled by more than this; so does the report of a body."""
+EXCESS = {
+    "space_error": (
+        "second half of the space",
+        "space",
+        "its first six frequencies may be that much too high, by corners, branches or thin walls that its kernels do"
+        " not resolve, whatever the number of functions",
+        "build it with twice the points (--points): more points allow narrower kernels",
+    ),
+    "driven_error": (
+        "excess of stiffness between regions",
+        "regions",
+        "its regions may resist each other's motion that much too stiffly",
+        "build it with twice the points (--points), or more functions (--functions)",
+    ),
+}
+"""What a build says of its own stiffness: names of a measure and a finding, what it means, and the remedy, by key."""
+EXCESS_WARNING = 0.05
+"""A build says so where one of these is larger; so does the report of a body."""
 TARGET_COUNT = 40
 """Elastic modes among the targets; it does not depend on the number of functions, or these would not be nested."""
 JUDGED_COUNT = 6
