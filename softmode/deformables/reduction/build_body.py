@@ -263,8 +263,9 @@ def _warn_of_stiffness(name: str, basis: BodyBasis, options: BuildOptions) -> No
         RuntimeWarning: If its kernels do not resolve it, or motions of its regions, or its Poisson's ratio wants more
             functions.
     """
-    for key, (_, _, what, remedy) in EXCESS.items():
+    for key in ("space_error", "driven_error"):
         if (error := basis.report.get(key, 0.0)) > EXCESS_WARNING:
+            what, remedy = EXCESS[key][2:]
             text = f"body {name!r}: {key} {100.0 * error:.0f} %: {what}; {remedy}"
             warnings.warn(text, RuntimeWarning, stacklevel=4)
     ratio = max(options.poissons_ratios)

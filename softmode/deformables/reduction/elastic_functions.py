@@ -36,7 +36,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from softmode.deformables.reduction.functions import KEPT_TOLERANCE, independent, orthonormal_in_mass
+from softmode.deformables.reduction.functions import KEPT_TOLERANCE, RawFunctions, independent, orthonormal_in_mass
 from softmode.deformables.reduction.options import FUNCTION_COUNT, FUNCTION_LEAST, FUNCTION_LIMIT, BuildOptions
 from softmode.deformables.reduction.reduced_stiffness import elastic_stiffness
 from softmode.deformables.reduction.static_response import lame_parameters, second_order_load
@@ -50,6 +50,12 @@ too stiff with 48 and 1.5 % with 96, for three times the time."""
 SPACE_ERROR = 0.02
 """The space is made larger where its second half lowers one of the first six frequencies by more than this."""
 EXCESS = {
+    "frequency_error": (
+        "error of the first frequencies",
+        "functions",
+        "its first six frequencies are that much too high with its functions",
+        "build it with --accuracy 0.03, or more --functions",
+    ),
     "space_error": (
         "second half of the space",
         "space",
@@ -66,7 +72,8 @@ EXCESS = {
 }
 """What a build says of its own stiffness: names of a measure and a finding, what it means, and the remedy, by key."""
 EXCESS_WARNING = 0.05
-"""A build says so where one of these is larger; so does the report of a body."""
+"""The report of a body says so where one of these is larger; so does a build, but for what the functions lack, whose
+number is asked for."""
 TARGET_COUNT = 40
 """Elastic modes among the targets; it does not depend on the number of functions, or these would not be nested."""
 JUDGED_COUNT = 6
@@ -158,10 +165,7 @@ class ElasticChoice:
 
 
 def choose_functions(
-    raw: Array,
-    raw_gradient: Array,
-    mass: Array,
-    stiff: Array,
+    raw: RawFunctions,
     *,
     lead: Array,
     kept: NDArray[np.intp],
@@ -174,10 +178,7 @@ def choose_functions(
     """Choose functions by elastic energy.
 
     Args:
-        raw: Raw functions at the quadrature points, (P, R).
-        raw_gradient: Their gradients [1/m], (P, R, 3).
-        mass: Fractions of mass, shape (P,).
-        stiff: Fractions of volume times relative Young's modulus, shape (P,).
+        raw: Raw functions.
         lead: Functions = raw @ lead that come first, shape (R, f): 1, x, y, z of a body without exact regions.
         kept: Raw functions that come next: affine motions of soft regions.
         others: Raw functions that the rest is chosen from. On a body with exact regions all of these vanish there.
@@ -194,8 +195,8 @@ def choose_functions(
         BasisError: If the elastic stiffness is singular.
     """
     count, accuracy = options.function_count, options.accuracy
-    space = _ElasticSpace(raw, raw_gradient, mass, stiff, lead, kept, others, held)
-    fields = None if quadratic is None else space.transform.T @ (raw.T @ (mass[:, None] * raw[:, quadratic]))
+    space = _ElasticSpace(raw, lead, kept, others, held)
+    fields = None if quadratic is None else space.transform.T @ raw.products(quadratic)
     driven = 0 if held is None else held.driven.shape[1]
     most = FUNCTION_LIMIT if accuracy is not None else count or FUNCTION_COUNT
     least = driven + space.fixed
@@ -207,7 +208,7 @@ def choose_functions(
     order, shares, modes = space.order(fields, options.poissons_ratios, min(most - driven, space.count))
     chosen = order.shape[1]
     error = space.frequency_error(order, modes)
-    smaller = None if half is None else space.spanned(raw.T @ (mass[:, None] * raw[:, half]))
+    smaller = None if half is None else space.spanned(raw.products(half))
     if accuracy is not None:
         if error > accuracy:
             raise ConfigError(
@@ -228,7 +229,7 @@ def choose_functions(
             stacklevel=2,
         )
     return ElasticChoice(
-        transform=orthonormal_in_mass(space.transform @ order[:, :chosen], raw, mass),
+        transform=orthonormal_in_mass(space.transform @ order[:, :chosen], raw),
         frequency_error=error,
         space_error=None if smaller is None else space.frequency_error(smaller, modes),
         driven_error=space.driven_error([order[:, :chosen], *([] if smaller is None else [smaller])]),
@@ -250,23 +251,18 @@ class _ElasticSpace:
 
     def __init__(
         self,
-        raw: Array,
-        raw_gradient: Array,
-        mass: Array,
-        stiff: Array,
+        raw: RawFunctions,
         lead: Array,
         kept: NDArray[np.intp],
         others: NDArray[np.intp],
         held: Held | None,
     ) -> None:
         tolerance = SPACE_TOLERANCE if held is None else HELD_SPACE_TOLERANCE
-        self.transform, (self.fixed, self.count) = independent(
-            raw, mass, lead, [(kept, KEPT_TOLERANCE), (others, tolerance)]
-        )
+        self.transform, (self.fixed, self.count) = independent(raw, lead, [(kept, KEPT_TOLERANCE), (others, tolerance)])
         """Functions = raw @ transform, shape (R, V); how many come first in any case, and how many there are."""
         every = self.transform if held is None else np.concatenate([self.transform, held.driven], axis=1)
-        root = np.sqrt(stiff)[:, None]
-        slopes = [raw_gradient[:, :, d] * root for d in range(3)]
+        root = np.sqrt(raw.stiff)[:, None]
+        slopes = [raw.gradient[:, :, d] * root for d in range(3)]
         self.products = np.empty((3, every.shape[1], 3, every.shape[1]))
         """sum_p s_p d_i b_k d_j b_l, driven functions last, shape (3, V + r, 3, V + r)."""
         for d in range(3):
@@ -288,9 +284,9 @@ class _ElasticSpace:
             pull = held.springs @ self.transform
             self.springs = pull.T @ pull
             self.energy = self.energy + self.springs
-            self.mean = self.transform.T @ (raw.T @ mass)
-            self.slopes, self.stiff = [raw_gradient[:, :, d] for d in range(3)], stiff
-            turned = self.transform.T @ (raw.T @ (mass[:, None] * raw[:, held.turned]))
+            self.mean = self.transform.T @ (raw.value.T @ raw.mass)
+            self.slopes, self.stiff = [raw.gradient[:, :, d] for d in range(3)], raw.stiff
+            turned = self.transform.T @ raw.products(held.turned)
             turned *= TURN_LEVEL * held.level / np.sqrt(np.einsum("ak,ab,bk->k", turned, self.energy, turned))
             self.turned = np.concatenate([turned, np.zeros((2 * self.count, turned.shape[1]))])
 

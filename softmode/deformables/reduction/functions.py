@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,23 @@ TRACE_TOLERANCE = 1e-6
 there by construction, so what lies between 1e-12 and 1e-3 is empty."""
 
 
+class RawFunctions(NamedTuple):
+    """Raw functions at the quadrature points of a body, and what these weigh."""
+
+    value: Array
+    """Values, shape (P, R)."""
+    gradient: Array
+    """Gradients [1/m], shape (P, R, 3)."""
+    mass: Array
+    """Fractions of mass V_p rho_p / V, shape (P,)."""
+    stiff: Array
+    """Fractions of volume times relative Young's modulus, shape (P,)."""
+
+    def products(self, index: NDArray[np.intp]) -> Array:
+        """Return the mass products of all functions with some of them, shape (R, len(index))."""
+        return self.value.T @ (self.mass[:, None] * self.value[:, index])
+
+
 @dataclass(frozen=True, kw_only=True)
 class Functions:
     """The transform and what follows from it."""
@@ -50,13 +68,12 @@ class Functions:
 
 
 def independent(
-    raw: Array, mass: Array, lead: Array, groups: Sequence[tuple[NDArray[np.intp], float]]
+    raw: RawFunctions, lead: Array, groups: Sequence[tuple[NDArray[np.intp], float]]
 ) -> tuple[Array, list[int]]:
     """Return functions that are orthonormal in mass: those of `lead`, then what groups of raw functions add to them.
 
     Args:
-        raw: Raw functions at the quadrature points, (P, R).
-        mass: V_p rho_p / V, shape (P,).
+        raw: Raw functions.
         lead: Functions = raw @ lead that come first, each within the span of those up to it, shape (R, f).
         groups: Raw functions that come next, and for each group the fraction of the largest under which directions of
             the scaled mass Gram matrix are dropped.
@@ -64,7 +81,7 @@ def independent(
     Returns:
         Functions = raw @ transform, (R, V), and how many there are up to the end of each group.
     """
-    weighted = raw * np.sqrt(mass)[:, None]
+    weighted = raw.value * np.sqrt(raw.mass)[:, None]
     scale = 1.0 / np.maximum(np.linalg.norm(weighted, axis=0), 1e-300)
     weighted *= scale
     lead = lead / scale[:, None]
@@ -83,7 +100,7 @@ def independent(
             size, vector = linalg.eigh(rest.T @ rest, check_finite=False)
             keep = size > tolerance * size[-1]
             turn = vector[:, keep] / np.sqrt(size[keep])
-            part = np.zeros((raw.shape[1], turn.shape[1]))
+            part = np.zeros((weighted.shape[1], turn.shape[1]))
             part[index] = turn
             transform = np.concatenate([transform, part - transform @ (content @ turn)], axis=1)
             if i + 1 < len(groups):  # What comes after must be apart from these.
@@ -92,27 +109,23 @@ def independent(
     return transform * scale[:, None], counts
 
 
-def split_at_regions(lead: Array, raw: Array, mass: Array, trace: Array) -> tuple[Array, Array]:
+def split_at_regions(lead: Array, raw: RawFunctions, trace: Array) -> tuple[Array, Array]:
     """Return functions that vanish on exact regions, and others of the same span that carry the regions.
 
     Args:
         lead: Functions = raw @ lead of affine motion, of the body and of its regions, shape (R, f); no others have
             traces.
-        raw: Raw functions at the quadrature points, (P, R).
-        mass: V_p rho_p / V, shape (P,).
+        raw: Raw functions.
         trace: Raw functions at points that fill the regions, (T, R).
     """
-    lead = orthonormal_in_mass(lead, raw, mass)
+    lead = orthonormal_in_mass(lead, raw)
     size, across = np.linalg.svd(np.linalg.qr(trace @ lead, mode="r"))[1:]
     count = int((size > TRACE_TOLERANCE * size[0]).sum())
     return lead @ across[count:].T, lead @ across[:count].T
 
 
 def orthonormalise(
-    raw: Array,
-    raw_gradient: Array,
-    mass: Array,
-    stiff: Array,
+    raw: RawFunctions,
     *,
     lead: Array,
     kept: NDArray[np.intp],
@@ -122,10 +135,7 @@ def orthonormalise(
     """Return all functions, orthonormal in mass, those after the first by ascending mean square gradient.
 
     Args:
-        raw: Raw functions at the quadrature points, (P, R).
-        raw_gradient: Their gradients [1/m], (P, R, 3).
-        mass: V_p rho_p / V, shape (P,).
-        stiff: Weights of the gradient energy that orders the functions, shape (P,).
+        raw: Raw functions.
         lead: Functions = raw @ lead that come first whatever their size, shape (R, f): 1, x, y, z of a body without
             exact regions, else those of affine motion that vanish there.
         kept: Raw functions that come next and are dropped only when they repeat others to rounding.
@@ -139,12 +149,12 @@ def orthonormalise(
     Raises:
         BasisError: If the weights add nothing to affine motion.
     """
-    found, _ = independent(raw, mass, lead, [(kept, KEPT_TOLERANCE), (others, rank_tolerance)])
+    found, _ = independent(raw, lead, [(kept, KEPT_TOLERANCE), (others, rank_tolerance)])
     if found.shape[1] == lead.shape[1]:
         raise BasisError("the eigenmodes add nothing to affine motion", hint="Use more modes or kernels.")
-    found, fixed = orthonormal_in_mass(found, raw, mass), lead.shape[1]
-    slopes = [raw_gradient[:, :, d] @ found[:, fixed:] for d in range(3)]
-    turn = np.linalg.eigh(sum(slope.T @ (stiff[:, None] * slope) for slope in slopes))[1]
+    found, fixed = orthonormal_in_mass(found, raw), lead.shape[1]
+    slopes = [raw.gradient[:, :, d] @ found[:, fixed:] for d in range(3)]
+    turn = np.linalg.eigh(sum(slope.T @ (raw.stiff[:, None] * slope) for slope in slopes))[1]
     turn *= np.sign(turn[np.abs(turn).argmax(axis=0), np.arange(turn.shape[1])])
     return np.concatenate([found[:, :fixed], found[:, fixed:] @ turn], axis=1)
 
@@ -161,43 +171,39 @@ def affine_first(transform: Array, leading: NDArray[np.intp], length: float) -> 
     return Functions(transform=transform, mean=np.eye(1, transform.shape[1])[0], linear=linear, driven_count=0)
 
 
-def driven_first(
-    driven: Array, free: Array, raw: Array, mass: Array, leading: NDArray[np.intp], length: float
-) -> Functions:
+def driven_first(driven: Array, free: Array, raw: RawFunctions, leading: NDArray[np.intp], length: float) -> Functions:
     """Return functions of a body with exact regions: those that carry the regions, then those that vanish there.
 
     Args:
         driven: Functions = raw @ driven that carry the regions, shape (R, r).
         free: Functions = raw @ free that vanish there, orthonormal in mass, shape (R, m); they stay as they are.
-        raw: Raw functions at the quadrature points, (P, R).
-        mass: V_p rho_p / V, shape (P,).
+        raw: Raw functions.
         leading: The raw functions x, y, z and 1, in the span of all.
         length: Unit of length of the raw functions [m].
     """
-    weighted = mass[:, None] * raw
+    weighted = raw.mass[:, None] * raw.value
     for _ in range(2):
-        driven = driven - free @ (free.T @ (weighted.T @ (raw @ driven)))
-    transform = np.concatenate([orthonormal_in_mass(driven, raw, mass), free], axis=1)
-    values, fields = raw @ transform, raw[:, leading[:4]]
+        driven = driven - free @ (free.T @ (weighted.T @ (raw.value @ driven)))
+    transform = np.concatenate([orthonormal_in_mass(driven, raw), free], axis=1)
+    values, fields = raw.value @ transform, raw.value[:, leading[:4]]
     linear = np.zeros((values.shape[1], 4))
     for _ in range(2):  # The second pass repairs rounding.
-        linear += values.T @ (mass[:, None] * (fields - values @ linear))
+        linear += values.T @ (raw.mass[:, None] * (fields - values @ linear))
     linear *= [length, length, length, 1.0]
     return Functions(transform=transform, mean=linear[:, 3].copy(), linear=linear, driven_count=driven.shape[1])
 
 
-def orthonormal_in_mass(transform: Array, raw: Array, mass: Array) -> Array:
+def orthonormal_in_mass(transform: Array, raw: RawFunctions) -> Array:
     """Return a transform (R, n) whose functions are orthonormal, from one whose functions nearly are.
 
     A pass against the functions themselves repairs what the squared condition number of a Gram matrix cost.
 
     Args:
         transform: b = raw @ transform, shape (R, n).
-        raw: Raw functions at the quadrature points, (P, R).
-        mass: V_p rho_p / V, shape (P,).
+        raw: Raw functions.
     """
-    values = raw @ transform
-    return transform @ np.linalg.inv(np.linalg.cholesky(values.T @ (mass[:, None] * values))).T
+    values = raw.value @ transform
+    return transform @ np.linalg.inv(np.linalg.cholesky(values.T @ (raw.mass[:, None] * values))).T
 
 
 def _linear_coordinates(transform: Array, leading: NDArray[np.intp], length: float) -> Array:

@@ -252,15 +252,6 @@ def _check_geometry(body: ReducedBody, notes: _Notes) -> None:
             f"its {kernels} kernels move between {points} quadrature points at no cost of energy: too soft",
             "build it with more points, or without a number of kernels",
         )
-    error = body.provenance.get("frequency_error")
-    if error is not None and float(notes.measure("error of the first frequencies", float(error))) > EXCESS_WARNING:
-        notes.find(
-            "warning",
-            "functions",
-            f"its first six frequencies are up to {100.0 * float(error):.0f} % too high with {body.function_count}"
-            " functions",
-            "build it with --accuracy 0.03, or more --functions",
-        )
     for key, (measure, finding, what, remedy) in EXCESS.items():
         excess = body.provenance.get(key)
         if excess is not None and notes.measure(measure, float(excess)) > EXCESS_WARNING:
@@ -274,26 +265,17 @@ def _check_geometry(body: ReducedBody, notes: _Notes) -> None:
             f" {complete:.0f} would have all of it",
             f"build it with --functions {complete:.0f}",
         )
-    if error is not None or body.regions.names:
+    if "frequency_error" in body.provenance or body.regions.names:
         return
-    degrees = body.handles.degrees
-    tolerance = body.provenance.get("option_rank_tolerance")
-    if slender < SLENDER and not (degrees == 2).any():
-        notes.find(
-            "warning",
-            "slender",
-            f"the body is slender or flat ({slender:.2f} of its length) and has affine handles, which make it a third"
-            " too stiff in bending",
-            "leave --modes and --handles away: then its functions are chosen by elastic energy",
-        )
-    elif slender < SLENDER and tolerance is not None and float(tolerance) >= RANK_TOLERANCE:
-        notes.find(
-            "warning",
-            "slender",
-            f"the body is slender or flat ({slender:.2f} of its length), and a rank tolerance of {float(tolerance):.0e}"
-            " takes the thin functions of its bending for noise",
-            "build it with --rank-tolerance 1e-9",
-        )
+    affine = not (body.handles.degrees == 2).any()
+    tolerance = float(body.provenance.get("option_rank_tolerance") or 0.0)
+    if slender < SLENDER and (affine or tolerance >= RANK_TOLERANCE):
+        what = " and has affine handles, which make it a third too stiff in bending"
+        remedy = "leave --modes and --handles away: then its functions are chosen by elastic energy"
+        if not affine:
+            what = f", and a rank tolerance of {tolerance:.0e} takes the thin functions of its bending for noise"
+            remedy = "build it with --rank-tolerance 1e-9"
+        notes.find("warning", "slender", f"the body is slender or flat ({slender:.2f} of its length){what}", remedy)
 
 
 def _check_shape(body: ReducedBody, notes: _Notes) -> None:

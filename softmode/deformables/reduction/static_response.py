@@ -150,35 +150,22 @@ def second_order_load(
 
 
 def solve_harmonic_weights(
-    shape: ShapeFunctions,
-    weights: Array,
-    *,
-    blend_gradient: Array,
-    stiffness_scale: Array,
-    springs: Array,
-    spring_load: Array,
+    shape: ShapeFunctions, weights: Array, *, stiffness_scale: Array, springs: Array, spring_load: Array
 ) -> Array:
-    """Find the weights of regions: one on a region, zero on the others, of least gradient energy between.
-
-    They serve a body with a soft region. The weight is T + sum_k c_k phi_k with T the blend of an exact
-    region, on all of which the kernels vanish, and T = 0 for a soft one, whose springs pull W to one.
+    """Find the weights of soft regions: one on a region, zero on the others, of least gradient energy between.
 
     Args:
         shape: Kernels at the quadrature points, (P, K), vanishing on all exact regions.
         weights: Quadrature weights [m^3], shape (P,).
-        blend_gradient: grad T [1/m], shape (P, C, 3).
         stiffness_scale: Relative Young's modulus, shape (P,).
-        springs: sum_r kappa / (lambda + 4 mu) V_r phi phi^T [m] of soft regions, shape (K, K).
-        spring_load: sum_r kappa / (lambda + 4 mu) V_r phi (w_r - T_r) [m] with w the value that the region of r asks
-            of the weight, shape (K, C).
+        springs: sum_r kappa / (lambda + 4 mu) V_r phi phi^T [m], shape (K, K).
+        spring_load: Of each soft region its kappa / (lambda + 4 mu) V_r phi [m], shape (K, C).
 
     Returns:
-        Coefficients c, shape (K, C).
+        Coefficients in the kernels, shape (K, C).
     """
-    stiff = weights * stiffness_scale
-    _, energy = mass_and_gradient_matrix(shape, weights, stiff)
-    load = -np.sum([g.T @ (stiff[:, None] * blend_gradient[:, :, d]) for d, g in enumerate(shape.gradient)], axis=0)
-    return _factor(energy + springs)(load + spring_load)
+    energy = mass_and_gradient_matrix(shape, weights, weights * stiffness_scale)[1]
+    return _factor(energy + springs)(spring_load)
 
 
 def _factor(matrix: Array) -> Callable[[Array], Array]:
