@@ -31,6 +31,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -207,8 +208,9 @@ def choose_functions(
         )
     order, shares, modes = space.order(fields, options.poissons_ratios, min(most - driven, space.count))
     chosen = order.shape[1]
-    error = space.frequency_error(order, modes)
-    smaller = None if half is None else space.spanned(raw.products(half))
+    few = space.restricted(order)
+    error = space.frequency_error(few, modes)
+    smaller = None if half is None else space.restricted(space.spanned(raw.products(half)))
     if accuracy is not None:
         if error > accuracy:
             raise ConfigError(
@@ -218,10 +220,11 @@ def choose_functions(
         low = space.fixed  # The error falls with the number of functions, because they are nested.
         while chosen - low > 1:
             middle = (low + chosen) // 2
-            reached = space.frequency_error(order[:, :middle], modes)
+            reached = space.frequency_error(space.restricted(order[:, :middle]), modes)
             low, chosen = (low, middle) if reached <= accuracy else (middle, chosen)
         chosen = min(_complete(shares, chosen), order.shape[1])
-        error = space.frequency_error(order[:, :chosen], modes)
+        few = space.restricted(order[:, :chosen])
+        error = space.frequency_error(few, modes)
     if count is not None and chosen + driven < count:
         warnings.warn(
             f"function_count: {count} asked for, the object's elastic modes make {chosen + driven}",
@@ -232,7 +235,7 @@ def choose_functions(
         transform=orthonormal_in_mass(space.transform @ order[:, :chosen], raw),
         frequency_error=error,
         space_error=None if smaller is None else space.frequency_error(smaller, modes),
-        driven_error=space.driven_error([order[:, :chosen], *([] if smaller is None else [smaller])]),
+        driven_error=space.driven_error([few, *([] if smaller is None else [smaller])]),
         space_count=space.count + driven,
         complete_count=_complete(shares, chosen) + driven,
         space_eigenvalues=modes,
@@ -244,6 +247,21 @@ def _complete(shares: Array, count: int) -> int:
     while count < len(shares) and shares[count] > EQUAL * shares[count - 1]:
         count += 1
     return count
+
+
+class _Part(NamedTuple):
+    """A part of a space, with what its functions cost."""
+
+    chosen: Array | None
+    """Its functions in the space, shape (V, n)."""
+    products: Array
+    """Of their gradients, shape (3, n, 3, n)."""
+    springs: Array
+    """What soft regions add for each component, per E, shape (n, n)."""
+
+    def stiffness(self, poissons_ratio: float) -> Array:
+        """Return their stiffness with the springs, (3 n, 3 n)."""
+        return elastic_stiffness(self.products, poissons_ratio) + np.kron(np.eye(3), self.springs)
 
 
 class _ElasticSpace:
@@ -276,6 +294,8 @@ class _ElasticSpace:
         """What soft regions add to the stiffness of each component, per E, shape (V, V)."""
         self.held, self.exact = held, held is not None and held.driven.shape[1] > 0
         self.rigid = RIGID if held is None else 0
+        self.factored: tuple[float, Array, Any] | None = None
+        """Poisson's ratio, stiffness of the free functions of a held body, its factor."""
         self.answered: tuple[float, Array, Array, Array] | None = None
         """Poisson's ratio, energy of driven functions, their pull on others, motions of regions of unit energy."""
         self.alone = held is not None and self.exact and not held.motions.shape[1]
@@ -334,24 +354,29 @@ class _ElasticSpace:
         vector, size, _ = np.linalg.svd(inside, full_matrices=False)
         return np.concatenate([np.eye(self.count, self.fixed), vector[:, size > 1e-5 * size[0]]], axis=1)
 
-    def frequency_error(self, chosen: Array, modes: dict[float, Array]) -> float:
-        """Return the largest relative error of the first frequencies of chosen functions (V, n)."""
-        part = np.einsum("ak,iajb,bl->ikjl", chosen, self.free, chosen, optimize=True)
-        springs, worst = chosen.T @ self.springs @ chosen, 0.0
+    def restricted(self, chosen: Array) -> _Part:
+        """Return the part of the space that some functions (V, n) span."""
+        products = np.empty((3, chosen.shape[1], 3, chosen.shape[1]))
+        for d in range(3):
+            for e in range(d + 1):
+                block = chosen.T @ self.free[d, :, e] @ chosen
+                products[d, :, e], products[e, :, d] = block, block.T
+        return _Part(chosen, products, chosen.T @ self.springs @ chosen)
+
+    def frequency_error(self, few: _Part, modes: dict[float, Array]) -> float:
+        """Return the largest relative error of the first frequencies of a part of the space."""
+        worst = 0.0
         for ratio, value in modes.items():
-            last = min(self.rigid + len(value), 3 * chosen.shape[1]) - 1
-            found = linalg.eigh(
-                elastic_stiffness(part, ratio) + np.kron(np.eye(3), springs),
-                eigvals_only=True,
-                subset_by_index=[self.rigid, last],
-                check_finite=False,
-            )
+            stiffness = few.stiffness(ratio)
+            last = min(self.rigid + len(value), len(stiffness)) - 1
+            which = [self.rigid, last]
+            found = linalg.eigh(stiffness, eigvals_only=True, subset_by_index=which, check_finite=False)
             real = value[: len(found)] > 1e-9 * value[-1]
             worst = max(worst, float((np.sqrt(found[real] / value[: len(found)][real]) - 1.0).max()))
         return worst
 
-    def driven_error(self, spaces: list[Array]) -> float | None:
-        """Return by how much exact regions are stiffer against each other in the worst of some spaces (V, n), or None.
+    def driven_error(self, parts: list[_Part]) -> float | None:
+        """Return by how much exact regions are stiffer against each other in the worst of some parts, or None.
 
         Of all their motions it is the worst one: the largest ratio of energies, less one.
         """
@@ -359,22 +384,37 @@ class _ElasticSpace:
             return None
         ratio, base, pull, motion = self.answered
         worst = 1.0
-        for chosen in spaces:
-            part = np.einsum("ak,iajb,bl->ikjl", chosen, self.free, chosen, optimize=True)
-            stiffness = elastic_stiffness(part, ratio) + np.kron(np.eye(3), chosen.T @ self.springs @ chosen)
-            load = np.einsum("ak,iam->ikm", chosen, pull.reshape(3, self.count, -1)).reshape(len(stiffness), -1)
+        for few in parts:
+            stiffness = few.stiffness(ratio)
+            load = np.einsum("ak,iam->ikm", few.chosen, pull.reshape(3, self.count, -1)).reshape(len(stiffness), -1)
             energy = base - load.T @ linalg.solve(stiffness, load, assume_a="pos", check_finite=False)
             worst = max(worst, float(np.linalg.eigvalsh(motion.T @ energy @ motion)[-1]))
         return worst - 1.0
 
-    def _stiffness(self, poissons_ratio: float) -> Array:
-        """Return the stiffness of the free functions with the springs of soft regions, (3 V, 3 V)."""
-        return elastic_stiffness(self.free, poissons_ratio) + np.kron(np.eye(3), self.springs)
+    def _solved(self, poissons_ratio: float) -> tuple[Array, Any]:
+        """Return the stiffness of the free functions of a held body (3 V, 3 V), and its factor; the last one is kept.
+
+        Raises:
+            BasisError: If nothing holds the body.
+        """
+        if self.factored is None or self.factored[0] != poissons_ratio:
+            stiffness = _Part(None, self.free, self.springs).stiffness(poissons_ratio)
+            try:
+                factor = linalg.cho_factor(stiffness.T, lower=True, check_finite=False)
+            except linalg.LinAlgError as error:
+                raise BasisError("the static response has no solution", hint="Hold the body by a region.") from error
+            self.factored = poissons_ratio, stiffness, factor
+        return self.factored[1:]
 
     def _targets(self, fields: Array | None, poissons_ratio: float, floor: float) -> tuple[Array, Array]:
         """Return the lowest elastic modes, then Ritz modes of fields, (3 V, T), and their eigenvalues (T,)."""
-        stiffness = self._stiffness(poissons_ratio)
-        value, mode = _lowest(stiffness, 1e3 * floor, min(TARGET_COUNT + RIGID, 3 * self.count - 1))
+        count = min(TARGET_COUNT + RIGID, 3 * self.count - 1)
+        if self.held is None:
+            stiffness = elastic_stiffness(self.free, poissons_ratio)
+            value, mode = _lowest(stiffness, count, 1e3 * floor)
+        else:
+            stiffness, factor = self._solved(poissons_ratio)
+            value, mode = _lowest(stiffness, count, factor=factor)
         value, mode = value[self.rigid :], mode[:, self.rigid :]
         if fields is None:
             return mode, value
@@ -385,10 +425,7 @@ class _ElasticSpace:
 
     def _responses(self, held: Held, poissons_ratio: float) -> tuple[Array, Array]:
         """Return static responses to unit body forces (3 V, 3); those of second order, slow loads and moved regions."""
-        try:
-            factor = linalg.cho_factor(self._stiffness(poissons_ratio), check_finite=False)
-        except linalg.LinAlgError as error:
-            raise BasisError("the static response has no solution", hint="Hold the body by a region.") from error
+        factor = self._solved(poissons_ratio)[1]
         force = np.kron(np.eye(3), self.mean[:, None])
         first = linalg.cho_solve(factor, force)
         first /= np.sqrt(np.einsum("ak,ak->k", first, force))
@@ -411,11 +448,10 @@ class _ElasticSpace:
                 more.append(answer * (LOAD_LEVEL / np.sqrt(np.linalg.eigvalsh(along.T @ answer)[-1])))
         if held.motions.shape[1]:
             # Constraint modes: the body's answer to rigid motions of its exact regions, as Ritz modes.
-            whole, free = elastic_stiffness(self.products, poissons_ratio), np.zeros(3 * self.products.shape[1], bool)
-            free.reshape(3, -1)[:, : self.count] = True
-            pull = whole[np.ix_(free, ~free)] @ held.motions
-            answer = -linalg.cho_solve(factor, pull)
-            base = held.motions.T @ whole[np.ix_(~free, ~free)] @ held.motions
+            whole = elastic_stiffness(self.products[:, :, :, self.count :], poissons_ratio)
+            whole = whole.reshape(3, -1, len(held.motions)) @ held.motions
+            pull, own = (part.reshape(-1, part.shape[2]) for part in (whole[:, : self.count], whole[:, self.count :]))
+            answer, base = -linalg.cho_solve(factor, pull), held.motions.T @ own
             value, vector = linalg.eigh(base + pull.T @ answer, held.motions.T @ held.motions + answer.T @ answer)
             motion = vector[:, RIGID:] / np.sqrt(value[RIGID:])
             self.answered = poissons_ratio, base, pull, motion
@@ -448,7 +484,7 @@ class _ElasticSpace:
         return np.concatenate([found, more * np.sign(np.diag(upper))], axis=1), share
 
 
-def _lowest(stiffness: Array, shift: float, count: int) -> tuple[Array, Array]:
+def _lowest(stiffness: Array, count: int, shift: float = 0.0, factor: Any = None) -> tuple[Array, Array]:
     """Return the lowest eigenpairs of a stiffness (N, N), ascending: block Lanczos on the shifted inverse.
 
     A block is wider than any cluster of equal frequencies, of which single vectors find one at a time, and is solved
@@ -458,12 +494,15 @@ def _lowest(stiffness: Array, shift: float, count: int) -> tuple[Array, Array]:
     if size <= 2 * BLOCK * steps:
         value, vector = linalg.eigh(stiffness, subset_by_index=[0, count - 1], check_finite=False)
     else:
-        shifted = stiffness.copy()
-        shifted[np.diag_indices(size)] += shift
-        try:
-            factor = linalg.cho_factor(shifted, check_finite=False, overwrite_a=True)
-        except linalg.LinAlgError as error:
-            raise BasisError("the elastic stiffness is singular", hint="Use fewer kernels or more points.") from error
+        if factor is None:
+            shifted = stiffness.copy()
+            shifted[np.diag_indices(size)] += shift
+            try:
+                factor = linalg.cho_factor(shifted, check_finite=False, overwrite_a=True)
+            except linalg.LinAlgError as error:
+                raise BasisError(
+                    "the elastic stiffness is singular", hint="Use fewer kernels or more points."
+                ) from error
         basis, small = np.empty((size, 0)), np.zeros((BLOCK * steps, BLOCK * steps))
         block = np.random.default_rng(0).normal(size=(size, BLOCK))
         for end in range(BLOCK, BLOCK * steps + 1, BLOCK):

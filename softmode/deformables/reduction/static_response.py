@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy import linalg, sparse
 
 from softmode.deformables.body.rkpm import ShapeFunctions
-from softmode.deformables.reduction.galerkin import elastic_matrix, mass_and_gradient_matrix
+from softmode.deformables.reduction.galerkin import elastic_matrix, mass_and_gradient_matrix, mass_matrix
 from softmode.errors import BasisError
 
 Array = NDArray[np.float64]
@@ -78,7 +78,7 @@ def solve_static_responses(
     solve = _factor(matrix)
     response = solve(np.kron(np.eye(3), (shape.value.T @ (weights * density))[:, None]))
     first = response.reshape(3, count, 3).transpose(2, 0, 1).reshape(9, count)
-    mass, energy = mass_and_gradient_matrix(shape, weights / weights.sum(), stiff)
+    mass = mass_matrix(shape, weights / weights.sum())
     size = np.sqrt(np.einsum("ik,kl,il->i", first, mass, first, optimize=True))
     parts = [first[size > NEGLIGIBLE * size.max()]]
     if mode_count:
@@ -86,6 +86,7 @@ def solve_static_responses(
         part = np.sqrt(np.einsum("ik,kl,il->i", modes, mass, modes, optimize=True))
         parts.append(modes[part > MODE_LEAST * part.max()])
     if derivative_count:
+        energy = mass_and_gradient_matrix(shape, weights, stiff)[1]
         load = second_order_load(shape.gradient, stiff, response.T.reshape(3, 3, count), poissons_ratio)[0]
         second = solve(load).reshape(3, count, -1).transpose(2, 0, 1).reshape(-1, count)
         # Without what the first order holds, in the gradient energy, and the rest by its share of that energy.
@@ -140,13 +141,14 @@ def second_order_load(
         strain = 0.5 * (matrix + matrix.transpose(0, 2, 1))
         return lame * np.trace(strain, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 2.0 * mu * strain
 
-    loads = []
+    stresses = []
     for i in range(3):
         for j in range(i, 3):
             h, k = slopes[i], slopes[j]
-            p = (stress(h.transpose(0, 2, 1) @ k) + k @ stress(h) + h @ stress(k)) * stiff[:, None, None]
-            loads.append(-np.sum([(g.T @ p[:, :, d]).T for d, g in enumerate(gradient)], axis=0).ravel())
-    return np.array(loads).T, np.array(sizes)
+            stresses.append((stress(h.transpose(0, 2, 1) @ k) + k @ stress(h) + h @ stress(k)) * stiff[:, None, None])
+    all_of_them = np.concatenate(stresses, axis=1)  # (P, pair and component, axis): each gradient is read once.
+    loads = -np.sum([g.T @ np.ascontiguousarray(all_of_them[:, :, d]) for d, g in enumerate(gradient)], axis=0)
+    return loads.T.reshape(len(stresses), -1).T, np.array(sizes)
 
 
 def solve_harmonic_weights(
@@ -176,7 +178,7 @@ def _factor(matrix: Array) -> Callable[[Array], Array]:
     for ridge in (0.0, 1e-12 * typical):  # The second for kernels that (numerically) repeat each other.
         matrix[diagonal] += ridge
         try:
-            factor = linalg.cho_factor(matrix, check_finite=False)
+            factor = linalg.cho_factor(matrix.T, lower=True, check_finite=False)
         except linalg.LinAlgError:
             continue
         return lambda load: linalg.cho_solve(factor, load, check_finite=False)
