@@ -155,7 +155,7 @@ def _build(
     seeds, bounds = places - offset, quadrature.bounds - offset
     length = float(np.sqrt(mass @ (seeds**2).sum(axis=1)))
     regions = tuple(region.moved(offset, bounds) for region in regions)
-    samples = sample_regions(regions, pieces, offset, stiffness, quadrature.spacing)
+    samples = sample_regions(regions, pieces, offset, stiffness, quadrature.spacing, bounds)
     points, volumes, parent = refine_at_faces(regions, pieces, offset)
     stiffness = stiffness[parent]
     seconds: dict[str, float] = {}
