@@ -167,13 +167,11 @@ def make_body_basis(
         return _basis(ground, domain, options, modes, stage)
     counts = (QUICK_SLIT_MODES, QUICK_SLIT_MODES) if quick and len(domain.lips) else SPACE_MODE_COUNTS
     small, large = (min(count, ground.most_modes) for count in counts)
+    if domain.regions and ground.kernels.kernel_count < options.kernels(len(domain.seeds)):
+        small = large  # A body that has no room for so many kernels is thin, and wants the large space in any case.
     alone = ground.envelope is not None and len(domain.regions) == 1 and large > small > ALONE_QUADRATIC
-    # A body that has no room for as many kernels as asked for is thin: it wants the large space in any case.
-    thin = domain.regions and ground.kernels.kernel_count < options.kernels(len(domain.seeds))
-    modes = _modes(ground, domain, options, large if alone or thin else small)
-    basis = _basis(ground, domain, options, modes, stage, quadratic=ALONE_QUADRATIC if alone and not thin else None)
-    if thin:
-        return basis
+    modes = _modes(ground, domain, options, large if alone else small)
+    basis = _basis(ground, domain, options, modes, stage, quadratic=ALONE_QUADRATIC if alone else None)
     if basis.report["space_error"] > (ALONE_ERROR if alone else SPACE_ERROR) and large > small:
         modes = modes if alone else _modes(ground, domain, options, large)
         basis = _basis(ground, domain, options, modes, stage)
