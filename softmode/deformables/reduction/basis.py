@@ -221,7 +221,7 @@ def _ground(domain: Domain, options: BuildOptions) -> _Ground:
     plain = kernels.evaluate(domain.points)
     shape, blend, blend_slope = enveloped(plain, envelope)
     springs, pull = _springs(kernels, envelope, domain)
-    mu, lame = lame_parameters(_mean_ratio(options))
+    mu, lame = lame_parameters(float(np.mean(options.poissons_ratios)))
     scalar = 1.0 / (lame + 4.0 * mu)
     return _Ground(
         kernels=kernels,
@@ -456,11 +456,6 @@ def _rank_tolerance(domain: Domain, options: BuildOptions) -> float:
     return min(options.rank_tolerance, HELD_RANK_TOLERANCE if domain.regions or options.local else np.inf)
 
 
-def _mean_ratio(options: BuildOptions) -> float:
-    """Return the Poisson's ratio of the static responses."""
-    return sum(options.poissons_ratios) / len(options.poissons_ratios)
-
-
 def _springs(kernels: BasisRKPM, envelope: Envelope | None, domain: Domain) -> tuple[Array | None, Array | None]:
     """Return what soft regions add, per E: springs [m] (K, K), and the pull of each on its weight [m] (K, S)."""
     samples = domain.samples
@@ -522,7 +517,7 @@ def _weights(
             shape,
             domain.volumes,
             density=domain.density,
-            poissons_ratio=_mean_ratio(options),
+            poissons_ratio=float(np.mean(options.poissons_ratios)),
             stiffness_scale=domain.stiffness,
             springs=springs,
             derivative_count=0 if options.chosen else options.response_derivatives,

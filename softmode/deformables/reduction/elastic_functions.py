@@ -252,7 +252,7 @@ def _complete(shares: Array, count: int) -> int:
 class _Part(NamedTuple):
     """A part of a space, with what its functions cost."""
 
-    chosen: Array | None
+    chosen: Array
     """Its functions in the space, shape (V, n)."""
     products: Array
     """Of their gradients, shape (3, n, 3, n)."""
@@ -398,7 +398,7 @@ class _ElasticSpace:
             BasisError: If nothing holds the body.
         """
         if self.factored is None or self.factored[0] != poissons_ratio:
-            stiffness = _Part(None, self.free, self.springs).stiffness(poissons_ratio)
+            stiffness = elastic_stiffness(self.free, poissons_ratio) + np.kron(np.eye(3), self.springs)
             try:
                 factor = linalg.cho_factor(stiffness.T, lower=True, check_finite=False)
             except linalg.LinAlgError as error:

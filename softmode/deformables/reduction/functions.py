@@ -169,7 +169,8 @@ def affine_first(transform: Array, leading: NDArray[np.intp], length: float) -> 
         leading: The raw functions x, y, z and 1.
         length: Unit of length of the raw functions [m].
     """
-    linear = _linear_coordinates(transform, leading, length)
+    linear = np.zeros((transform.shape[1], 4))
+    linear[:4] = np.linalg.solve(transform[leading[:4], :4], np.diag([length, length, length, 1.0]))
     return Functions(transform=transform, mean=np.eye(1, transform.shape[1])[0], linear=linear, driven_count=0)
 
 
@@ -206,10 +207,3 @@ def orthonormal_in_mass(transform: Array, raw: RawFunctions) -> Array:
     """
     values = raw.value @ transform
     return transform @ np.linalg.inv(np.linalg.cholesky(values.T @ (raw.mass[:, None] * values))).T
-
-
-def _linear_coordinates(transform: Array, leading: NDArray[np.intp], length: float) -> Array:
-    """Return c (n, 4) with sum_k b_k c_kj = (X, Y, Z, 1)_j, where the first four functions span (x, y, z, 1)."""
-    linear = np.zeros((transform.shape[1], 4))
-    linear[:4] = np.linalg.solve(transform[leading[:4], :4], np.diag([length, length, length, 1.0]))
-    return linear
