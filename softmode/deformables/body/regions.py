@@ -73,7 +73,8 @@ class Region:
         if self.points is None:
             grown = np.asarray(self.box) + self.radius * np.array([[-1.0], [1.0]])
             return float(np.ptp(np.clip(grown, *bounds), axis=0).min())
-        span = np.asarray(self.points) - np.mean(self.points, axis=0)
+        span = np.asarray(self.points)
+        span = span - span.mean(axis=0)
         span = span @ np.linalg.svd(span, full_matrices=len(span) < 3)[2].T
         return float(np.ptp(span, axis=0).min()) + 2.0 * self.radius
 
