@@ -27,6 +27,7 @@ from softmode.learning.networks import Actor, Observation
 from softmode.learning.run_folder import checkpoint_in
 from softmode.learning.spaces import Interface
 from softmode.learning.vector_tensors import TensorVectorEnv, action_range, tensors_of
+from softmode.stages import stage
 
 EVALUATION_SEED = 1_000_000_000
 """First seed of evaluation episodes; training draws its seeds below."""
@@ -182,6 +183,7 @@ class Evaluation:
 
 
 @torch.no_grad()
+@stage("playing episodes")
 def evaluate(
     env: gym.Env | gym.vector.VectorEnv,
     policy: Callable[[Any], Any],
