@@ -289,7 +289,7 @@ def test_reward_is_the_sum_of_its_terms(lift: LiftSoftEnv) -> None:
     for _, reward, _, _, info in rollout(lift, 10, seed=0)[1:]:
         terms = info["reward_terms"]
         assert reward == pytest.approx(sum(terms.values()), rel=1e-6)
-        assert set(terms) == {"reach", "grasp", "lift", "goal", "hold"}
+        assert set(terms) == {"reach", "grasp", "lift", "goal", "hold", "gentle"}
         assert 0.0 < terms["reach"] < 1.0 and sum(terms.values()) == terms["reach"]
         assert info["is_success"] is False
 

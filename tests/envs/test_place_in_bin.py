@@ -112,7 +112,7 @@ def test_reward_is_the_sum_of_its_terms(env: PlaceInBinEnv) -> None:
     """The reward equals the sum of its terms, each within its bounds; an idle arm is rewarded for being near only."""
     env.reset(seed=3)
     random = np.random.default_rng(0)
-    bounds = {"reach": 1.0, "grasp": 0.5, "carry": 3.0, "release": 2.0, "rest": 2.0}
+    bounds = {"reach": 1.0, "grasp": 0.5, "carry": 3.0, "release": 2.0, "rest": 2.0, "gentle": 0.0}
     assert tuple(bounds) == env.task.term_names
     for k in range(10):
         _, reward, _, _, info = env.step(IDLE if k < 3 else random.uniform(-1.0, 1.0, 5).astype(np.float32))
