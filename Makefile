@@ -36,7 +36,7 @@ unexport PYTHONDONTWRITEBYTECODE
 unexport VIRTUAL_ENV
 
 .DEFAULT_GOAL := help
-.PHONY: help lock resolve demo test test-fast test-rest test-slow lint docs dist smoke bench accuracy baselines clean coupling
+.PHONY: help lock resolve demo test test-fast test-rest test-slow test-lowest lint docs dist smoke bench accuracy baselines clean coupling
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -94,6 +94,13 @@ test-rest: $(VENV)/.dev | $(WARP_CACHE_PATH)  ## run what `make test` leaves out
 
 test-slow: $(VENV)/.dev | $(WARP_CACHE_PATH)  ## run all tests, slow ones included
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(FILES) -m 'slow or not slow' $(ARGS)
+
+LOWEST := .venv-lowest
+test-lowest: $(VENV)/.dev | $(WARP_CACHE_PATH)  ## run the tests with the lowest versions that pyproject.toml allows
+	$(PYTHON) -m venv $(LOWEST)
+	$(LOWEST)/bin/python -m pip install --quiet '$(TORCH)'
+	$(UV) pip install --quiet --python $(LOWEST)/bin/python --resolution lowest-direct --editable '.[dev]'
+	OMP_NUM_THREADS=1 $(LOWEST)/bin/python -m pytest $(FILES) $(ARGS)
 
 lint: $(VENV)/.dev  ## ruff, pyright, words that may not come back, names of what is not there
 	$(BIN)/ruff check .
