@@ -50,7 +50,8 @@ class SoftmodeWorlds(gym.vector.VectorWrapper):
         super().__init__(env)
         from softmode.envs.catalogue import purpose
 
-        base: Any = env.unwrapped
+        self._base: Any = env.unwrapped
+        base = self._base
         assert env.spec is not None
         self.camera, self.task, self.task_description = camera, env.spec.id, purpose(env.spec.id)
         self._max_episode_steps = base.max_episode_steps
@@ -76,7 +77,7 @@ class SoftmodeWorlds(gym.vector.VectorWrapper):
 
     def _view(self, observation: Any) -> dict[str, Any]:
         if self._state:
-            vector = self.env.unwrapped.state_observation  # also where the observation is a dict of goals
+            vector = self._base.state_observation  # also where the observation is a dict of goals
             return {
                 "agent_pos": vector[:, : self._agent_size].copy(),
                 "environment_state": vector[:, self._agent_size :].copy(),
