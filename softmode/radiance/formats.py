@@ -48,9 +48,10 @@ def read_radiance(path: str | os.PathLike[str]) -> RadianceGrid:
     """Read a radiance field.
 
     `.npz`: `density` [1/m] with `bounds`, corners of first and last node [m] (2, 3), and colours `rgb` (..., 3) or
-    coefficients `sh` (..., K, 3), and `metres`, those of a unit of length, if they are known; or what `write_radiance` wrote; or a checkpoint of Plenoxels (Fridovich-Keil et al.
-    2022), of which background and learned bases are not read; or a PlenOctree, see `field_of_plenoctree`. `.nvdb`: the first grid of numbers is the density, one of
-    vectors the colour 0..1, if there is one, else it is grey.
+    coefficients `sh` (..., K, 3), and `metres`, those of a unit of length, if they are known; or what `write_radiance`
+    wrote; or a checkpoint of Plenoxels (Fridovich-Keil et al. 2022), of which background and learned bases are not
+    read; or a PlenOctree, see `field_of_plenoctree`. `.nvdb`: the first grid of numbers is the density, one of vectors
+    the colour 0..1, if there is one, else it is grey.
 
     Raises:
         AssetError: If the file is missing, damaged, too large, of another kind, or holds no field.
