@@ -100,6 +100,12 @@ class PosedPicture:
         ways = np.concatenate([flat, np.ones((*flat.shape[:2], 1))], axis=-1) @ c.world_to_camera[:3, :3]
         return ways / np.linalg.norm(ways, axis=-1, keepdims=True)
 
+    def project(self, points: ArrayLike) -> Array:
+        """Return where the lens shows points (..., 3) of the frame of the folder [px], shape (..., 2)."""
+        c = self.camera
+        x = np.asarray(points, dtype=np.float64) @ c.world_to_camera[:3, :3].T + c.world_to_camera[:3, 3]
+        return self.lens.distorted(x[..., :2] / x[..., 2:]) * (c.fx, c.fy) + (c.cx, c.cy)
+
     def undistorted(self) -> NDArray[np.float32]:
         """Return the picture as the pinhole sees it, same shape."""
         return _resampled(self.camera, self.pixels(), self.lens.distorted)
