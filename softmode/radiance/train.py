@@ -62,7 +62,7 @@ def train_field(
         progress: Called with the step and the mean squared error after every step.
 
     Returns:
-        The field, in the frame and unit of the poses, 96 nodes an edge, of degree 0.
+        The field, in the frame and unit of the poses, 192 nodes an edge less what is empty, of degree 0.
 
     Raises:
         AssetError: If the pictures are of several sizes, or their silhouettes have nothing in common.
@@ -111,10 +111,13 @@ def train_field(
         if progress is not None:
             progress(step + 1, error.item())
     s, c = walls.dense()
+    s, c = 2.0 * ndimage.zoom(s, 2, order=1), ndimage.zoom(c, (2, 2, 2, 1), order=1)
+    beta *= 2.0  # of the finer grid, which keeps walls sharper than their nodes
     tail = 0.5 * np.exp(-np.abs(s) / beta)
-    density = np.where(s > 0.0, tail, 1.0 - tail) * (walls.n - 1) / (2.0 * half * beta)
+    density = np.where(s > 0.0, tail, 1.0 - tail) * (len(s) - 1) / (2.0 * half * beta)
     box = np.stack([middle - half, middle + half])
-    return RadianceGrid.from_bounds(density, c[..., None, :], box, name="trained field", metres=metres)
+    field = RadianceGrid.from_bounds(density, c[..., None, :], box, name="trained field", metres=metres)
+    return field.cropped(*(field.bounds + np.array([[-1.0], [1.0]]) * field.spacing))
 
 
 def _cube(pictures: Sequence[PosedPicture]) -> tuple[Array, float]:
@@ -187,7 +190,7 @@ class Walls:
         nearest = ndimage.distance_transform_edt(~self.near, return_distances=False, return_indices=True)
         return s[..., 0], c[tuple(nearest)]
 
-    def anew(self, n: int) -> "Walls":
+    def anew(self, n: int) -> Walls:
         """Return them with true distances from the surface of the largest part, perhaps on a finer grid."""
         s, c = self.dense()
         zoom = n / self.n
