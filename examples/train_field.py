@@ -16,8 +16,9 @@ from PIL import Image
 from scipy import ndimage
 
 from softmode.deformables import Material, status_reasons
+from softmode.learning import train_field
 from softmode.objects import Placed, SoftObject, load
-from softmode.radiance import render_radiance, train_field, write_radiance
+from softmode.radiance import render_radiance, write_radiance
 from softmode.scenes import SplatScene
 from softmode.splats import CameraOptions, Lens, PinholeCamera, SplatArrays, SplatRasterizer, ViewArrays
 from softmode.splats.raster.posed_pictures import read_transforms, write_transforms

@@ -38,11 +38,13 @@ class _Asset:
     """Or as many as the first six frequencies take to be this near to those of the whole space, such as 0.02."""
     modes: int | None = None
     """FreeForm's functions instead: so many skinning eigenmodes beside the constant handle."""
-    handles: Literal["affine", "quadratic", "local"] | None = None
+    handles: Literal["affine", "quadratic", "local", "qgmls"] | None = None
     """What each eigenmode carries: (X, Y, Z, 1), or all ten monomials up to degree two, for slender and flat bodies; or
-    local handles in their place."""
+    local handles, or PIE-NeRF's Q-GMLS, in their place."""
     local_count: int | None = None
-    """Number of local handles; 16 if omitted."""
+    """Number of local handles, or of kernels of Q-GMLS; 16 if omitted."""
+    kernels_at: tuple[tuple[float, float, float, float], ...] = ()
+    """X Y Z RADIUS of further ones, where more local motion is wanted [m]; repeat the four numbers for more."""
     kernels: int | None = None
     """Reproducing kernels; 1000 if omitted, 400 with eigenmodes."""
     points: int = 384
@@ -262,6 +264,7 @@ def _examined(options: _Asset) -> tuple[SoftObject, BodyReport]:
         given = same_fields(options, BuildOptions)
         given |= {"mode_count": options.modes, "kernel_count": options.kernels, "cubature_count": options.points}
         given |= {"function_count": options.functions, "poissons_ratio": options.poissons_ratio or None}
+        given["add_kernels"] = tuple((place, radius) for *place, radius in options.kernels_at)
         if options.rank_tolerance is None:
             given["rank_tolerance"] = RANK_TOLERANCE
         counts: dict[str, int | None] = {"splat_count": options.splats}

@@ -18,6 +18,5 @@ if TYPE_CHECKING:
     from softmode.radiance.march import RadianceMarch as RadianceMarch
     from softmode.radiance.march import render_radiance as render_radiance
     from softmode.radiance.sample import sampled_field as sampled_field
-    from softmode.radiance.train import train_field as train_field
 
 __getattr__, __dir__ = lazy_names(__name__)

@@ -41,7 +41,7 @@ def pictures(folder: Path, count: int) -> Path:
 
 def test_a_ball_is_a_ball(tmp_path: Path) -> None:
     """A few steps on ten small pictures leave a solid of walls with the ball's volume to a sixth, and its colours."""
-    from softmode.radiance import train_field
+    from softmode.learning import train_field
 
     told: list[float] = []
     found = train_field(
@@ -58,7 +58,7 @@ def test_a_ball_is_a_ball(tmp_path: Path) -> None:
 
 def test_silhouettes_without_anything_in_common(tmp_path: Path) -> None:
     """Pictures of a wall alone, or of several sizes, are refused."""
-    from softmode.radiance import train_field
+    from softmode.learning import train_field
 
     cameras = [PinholeCamera.look_at(f"{i}", position=(0.3, 0.1 * i, 0.1), target=(0.0, 0.0, 0.0), width=16, height=16)
                for i in range(3)]  # fmt: skip
