@@ -166,7 +166,7 @@ def plenoctree(**changes) -> dict[str, np.ndarray]:
 
 
 def test_plenoctree(tmp_path):
-    """Cell i of a grid lies at ((i + 1/2) / n - offset) / invradius; larger leaves fill several; colours are sigmoids."""
+    """Cell i lies at ((i + 1/2) / n - offset) / invradius; larger leaves fill several; colours are sigmoids."""
     np.savez_compressed(tmp_path / "tree.npz", **plenoctree())
     assert is_radiance(tmp_path / "tree.npz")
     field = read_radiance(tmp_path / "tree.npz")
