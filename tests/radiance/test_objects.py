@@ -56,7 +56,7 @@ def test_a_field_keeps_its_metres():
     given = replace(block_field(), metres=0.5)
     thing = load(given, **OPTIONS | {"size": None, "up": "+x"})
     assert thing.radiance is not None and thing.field_pose is not None and not thing.findings()
-    assert thing.body.volume == pytest.approx(load(given, **OPTIONS | {"size": 0.5 * SIZE[0]}).body.volume, rel=0.1)
+    assert np.prod(SIZE) < 8.0 * thing.body.volume < np.prod(np.array(SIZE) + 0.0045)
     places = np.random.default_rng(0).uniform(-0.02, 0.02, (50, 3))
     there = places @ thing.field_pose[:3, :3].T + thing.field_pose[:3, 3]
     np.testing.assert_allclose(thing.radiance.densities(there), 2.0 * given.densities(places), rtol=2e-3)
