@@ -134,17 +134,18 @@ def _cube(pictures: Sequence[PosedPicture]) -> tuple[Array, float]:
 def _hull(
     pictures: Sequence[PosedPicture], images: NDArray[np.float32], wall: Array, middle: Array, half: float
 ) -> NDArray[np.bool_]:
-    """Return the nodes of the coarse grid that lie in the silhouettes."""
+    """Return the nodes of the coarse grid that half of the pictures see, and that lie in the silhouettes."""
     line = np.linspace(-half, half, COARSE)
     nodes = np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1) + middle
-    beside = np.zeros((COARSE,) * 3, int)
+    beside, seen = np.zeros((COARSE,) * 3, int), np.zeros((COARSE,) * 3, int)
     for picture, image, back in zip(pictures, images, wall, strict=True):
         apart = np.abs(ndimage.gaussian_filter(image, (0.7, 0.7, 0.0)) - back).max(axis=-1) > CONTRAST
         front = ndimage.binary_dilation(ndimage.binary_opening(ndimage.binary_fill_holes(apart)), iterations=SLACK)
         j, i = np.moveaxis(np.floor(picture.project(nodes)).astype(int), -1, 0)
         inside = (i >= 0) & (i < front.shape[0]) & (j >= 0) & (j < front.shape[1])
+        seen += inside
         beside += inside & ~front[i.clip(0, front.shape[0] - 1), j.clip(0, front.shape[1] - 1)]
-    return ndimage.binary_erosion(beside < VOTES)  # type: ignore[return-value]
+    return ndimage.binary_erosion((beside < VOTES) & (2 * seen >= len(images)))  # type: ignore[return-value]
 
 
 def _reach(walls: Walls, eye: torch.Tensor, way: torch.Tensor, edge: float) -> tuple[torch.Tensor, torch.Tensor]:

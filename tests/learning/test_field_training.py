@@ -39,15 +39,17 @@ def pictures(folder: Path, count: int) -> Path:
     return folder
 
 
-def test_a_ball_is_a_ball(tmp_path: Path) -> None:
-    """A few steps on ten small pictures leave a solid of walls with the ball's volume to a sixth, and its colours."""
+def test_a_ball_is_a_ball(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ten small pictures and coarse grids leave a solid of walls with the ball's volume to a sixth, and its colours."""
     from softmode.learning import train_field
 
+    for name, value in {"COARSE": 24, "FINE": 32, "RAYS": 1024, "REGULAR": 1000}.items():
+        monkeypatch.setattr(f"softmode.learning.field_training.{name}", value)
     told: list[float] = []
     found = train_field(
-        read_transforms(pictures(tmp_path, 10)), steps=60, metres=1.0, progress=lambda _, error: told.append(error)
+        read_transforms(pictures(tmp_path, 10)), steps=120, metres=1.0, progress=lambda _, error: told.append(error)
     )
-    assert np.mean(told[-5:]) < 0.1 * np.mean(told[:5])
+    assert np.mean(told[-5:]) < 0.2 * np.mean(told[:5])
     box = found.bounds + np.array([[-1.0], [1.0]]) * found.spacing
     solid = quadrature_from_density(found.densities, box, surface_count=16, point_count=500)
     assert solid.volume == pytest.approx(4.0 / 3.0 * np.pi * RADIUS**3, rel=1.0 / 6.0)
