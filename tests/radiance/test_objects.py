@@ -73,7 +73,7 @@ def test_sampled_functions(tmp_path, monkeypatch, capsys):
     )
     monkeypatch.chdir(tmp_path)
     assert (
-        main(["radiance", "sample", "my_nerf:ball", "ball.npz", "--bounds", *"0 0 0 6 6 6".split(), "--metres", "1"])
+        main(["radiance", "sample", "my_nerf:ball", "ball.npz", "--bounds", *"2 2 2 4 4 4".split(), "--metres", "1"])
         == 0
     )
     found = read_radiance("ball.npz")
