@@ -26,7 +26,7 @@ _OURS = ("density", "sh", "origin", "axes")
 _PLAIN = ("density", "bounds")
 _PLENOXELS = ("links", "density_data", "sh_data", "radius", "center")
 _HINT = "export it again"
-_FREE, _DENSE_FREE = 256 << 20, 256 << 20
+_FREE, _DENSE_FREE = 128 << 20, 256 << 20
 
 
 def is_radiance(path: str | os.PathLike[str]) -> bool:
