@@ -10,18 +10,18 @@ from dataclasses import replace
 import pytest
 
 from softmode.deformables import BuildOptions
-from softmode.envs import LiftSoftConfig
+from softmode.envs import LiftSoftConfig, LiftSoftEnv
 from softmode.testing import assert_no_flag, assert_success
-from tests.envs.conftest import Episodes, MakeEnv
+from tests.envs.conftest import Episodes
 
 
 @pytest.mark.rest
 @pytest.mark.parametrize("handles", ["local", "qgmls"])
-def test_a_robot_lifts_them(make_env: MakeEnv, episode: Episodes, handles: str) -> None:
+def test_a_robot_lifts_them(episode: Episodes, handles: str) -> None:
     """The scripted policy lifts a toy of the functions of eight handles."""
     scene = LiftSoftConfig().scene
     build = BuildOptions(handles=handles, local_count=8)  # type: ignore[arg-type]
     config = LiftSoftConfig(scene=replace(scene, object=replace(scene.object, build=build)))
-    played = episode(make_env("LiftSoft", config=config), "scripted", 2)
+    played = episode(LiftSoftEnv(config=config, device="cpu"), "scripted", 2)
     assert_success(played)
     assert_no_flag(played, allow=["iteration_limit"])
