@@ -8,6 +8,7 @@ fog. It is carved out of the silhouettes first, which takes a backdrop that is k
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,13 +75,12 @@ def train_field(
     torch.manual_seed(seed)
     images = np.stack([picture.pixels()[..., :3] for picture in pictures])
     border = np.concatenate([images[:, :3].reshape(len(images), -1, 3), images[:, -3:].reshape(len(images), -1, 3)], 1)
-    wall = np.median(border, axis=1)
+    wall = np.median(border, axis=1).astype(np.float64)
     middle, half = _cube(pictures)
     carved = _hull(pictures, images, wall, middle, half)
     if not carved.any():
         raise AssetError("the silhouettes have nothing in common", hint="check poses, lens and that the wall is plain")
-    far = ndimage.distance_transform_edt(~carved) - ndimage.distance_transform_edt(carved)
-    walls = Walls(far - 0.5 * np.sign(far), np.zeros((*far.shape, 3)), inside=True)
+    walls = Walls(_distance(carved), np.zeros((*carved.shape, 3)), inside=True)
     gain = torch.tensor(np.log(wall.mean(axis=1)), dtype=torch.float32, requires_grad=True)
     exposures = torch.optim.Adam([gain], lr=RATES[2])
     eyes = torch.tensor(np.array([p.camera.position for p in pictures]) - middle + half, dtype=torch.float32)
@@ -99,8 +99,8 @@ def train_field(
             group["lr"] = rate * 0.1 ** ((step / steps) ** 2)
         ray = hit[torch.randint(len(hit), (RAYS,))]
         voxel, of = 2.0 * half / (walls.n - 1), ray // each
-        reach = (x[ray] / voxel for x in (first, last))
-        color, left = walls.march(eyes[of] / voxel, ways[ray], *reach, min(0.7, 1.2 * beta), beta)
+        near, far = first[ray] / voxel, last[ray] / voxel
+        color, left = walls.march(eyes[of] / voxel, ways[ray], near, far, min(0.7, 1.2 * beta), beta)
         seen = torch.exp(gain)[of, None] * (color + left[:, None])
         error = ((torch.minimum(seen, 1.0 + 0.01 * (seen - 1.0)) - target[ray]) ** 2).mean()  # cut at white
         for optimiser in (walls.optimiser, exposures):
@@ -111,8 +111,8 @@ def train_field(
         if progress is not None:
             progress(step + 1, error.item())
     s, c = walls.dense()
-    s, c = 2.0 * ndimage.zoom(s, 2, order=1), ndimage.zoom(c, (2, 2, 2, 1), order=1)
-    beta *= 2.0  # of the finer grid, which keeps walls sharper than their nodes
+    s, c = 2.0 * _zoomed(s, 2.0), _zoomed(c, 2.0)
+    beta = 2.0 * SHARPEST  # on the finer grid, which keeps walls sharper than their nodes
     tail = 0.5 * np.exp(-np.abs(s) / beta)
     density = np.where(s > 0.0, tail, 1.0 - tail) * (len(s) - 1) / (2.0 * half * beta)
     box = np.stack([middle - half, middle + half])
@@ -139,13 +139,27 @@ def _hull(
     nodes = np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1) + middle
     beside, seen = np.zeros((COARSE,) * 3, int), np.zeros((COARSE,) * 3, int)
     for picture, image, back in zip(pictures, images, wall, strict=True):
-        apart = np.abs(ndimage.gaussian_filter(image, (0.7, 0.7, 0.0)) - back).max(axis=-1) > CONTRAST
-        front = ndimage.binary_dilation(ndimage.binary_opening(ndimage.binary_fill_holes(apart)), iterations=SLACK)
+        apart: Any = np.abs(ndimage.gaussian_filter(image, (0.7, 0.7, 0.0)) - back).max(axis=-1) > CONTRAST
+        front: Any = ndimage.binary_dilation(ndimage.binary_opening(ndimage.binary_fill_holes(apart)), iterations=SLACK)
         j, i = np.moveaxis(np.floor(picture.project(nodes)).astype(int), -1, 0)
         inside = (i >= 0) & (i < front.shape[0]) & (j >= 0) & (j < front.shape[1])
         seen += inside
         beside += inside & ~front[i.clip(0, front.shape[0] - 1), j.clip(0, front.shape[1] - 1)]
-    return ndimage.binary_erosion((beside < VOTES) & (2 * seen >= len(images)))  # type: ignore[return-value]
+    hull: Any = ndimage.binary_erosion((beside < VOTES) & (2 * seen >= len(images)))
+    return hull
+
+
+def _distance(full: NDArray[np.bool_]) -> Array:
+    """Return the signed distance of nodes from the faces between full ones and others [voxels]."""
+    far: Any = ndimage.distance_transform_edt(~full)
+    far -= ndimage.distance_transform_edt(full)
+    return far - 0.5 * np.sign(far)
+
+
+def _zoomed(values: Array, zoom: float) -> Array:
+    """Return values (n, n, n, ...) at as many times more nodes an edge."""
+    found: Any = ndimage.zoom(values, (zoom,) * 3 + (1.0,) * (values.ndim - 3), order=1)
+    return found
 
 
 def _reach(walls: Walls, eye: torch.Tensor, way: torch.Tensor, edge: float) -> tuple[torch.Tensor, torch.Tensor]:
@@ -188,20 +202,22 @@ class Walls:
     def dense(self) -> tuple[np.ndarray, np.ndarray]:
         """Return distances and colours at all nodes; far ones have the colour of the nearest."""
         s, c = (x.detach()[self.rows].reshape(self.n, self.n, self.n, -1).numpy() for x in (self.s, self.c))
-        nearest = ndimage.distance_transform_edt(~self.near, return_distances=False, return_indices=True)
+        nearest: Any = ndimage.distance_transform_edt(~self.near, return_distances=False, return_indices=True)
         return s[..., 0], c[tuple(nearest)]
 
     def anew(self, n: int) -> Walls:
         """Return them with true distances from the surface of the largest part, perhaps on a finer grid."""
         s, c = self.dense()
         zoom = n / self.n
-        s = ndimage.zoom(np.clip(s, -3.0, 3.0), zoom, order=1) * zoom
-        parts, count = ndimage.label(s < 0.0)
-        full = parts == 1 + np.argmax(ndimage.sum_labels(s < 0.0, parts, np.arange(1, count + 1)))
-        far = ndimage.distance_transform_edt(~full) - ndimage.distance_transform_edt(full)
-        far -= 0.5 * np.sign(far)
+        s = _zoomed(np.clip(s, -3.0, 3.0), zoom) * zoom
+        found: Any = ndimage.label(s < 0.0)
+        parts, count = found
+        if not count:
+            raise AssetError("nothing is left of the object", hint="check exposure, poses, and that the wall is white")
+        full = parts == 1 + np.argmax(np.bincount(parts.ravel())[1:])
+        far = _distance(full)
         s = np.where((np.abs(s) < 1.5 * zoom) & (np.abs(far) < 2.5), np.sign(far) * np.abs(s), far)
-        return Walls(s, ndimage.zoom(c, (zoom, zoom, zoom, 1.0), order=1) if zoom != 1.0 else c, inside=n == COARSE)
+        return Walls(s, _zoomed(c, zoom) if zoom != 1.0 else c, inside=n == COARSE)
 
     def roughness(self) -> torch.Tensor:
         """Return what a step lowers beside the error: no distance, curved, colours that change from node to node."""

@@ -96,7 +96,7 @@ def write_radiance(path: str | os.PathLike[str], field: RadianceGrid) -> None:
     """
     if Path(path).suffix.lower() != ".npz":
         raise AssetError(f"radiance field {path}: cannot write this kind", hint="name it like toy.npz")
-    unit = {} if field.metres is None else {"metres": np.float64(field.metres)}
+    unit = {} if field.metres is None else {"metres": np.array(field.metres)}
     write_compressed(path, {name: getattr(field, name) for name in _OURS} | unit, "radiance field")
 
 

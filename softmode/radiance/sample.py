@@ -43,14 +43,16 @@ def sampled_field(
     """
     box = _found_box(field, name) if bounds is None else np.asarray(bounds, dtype=np.float64)
     rng = np.random.default_rng(0)
-    for count in RESOLUTIONS if resolution is None else (resolution,):
-        grid = replace(RadianceGrid.from_function(field, box, resolution=count, name=name), metres=metres)
+    counts = RESOLUTIONS if resolution is None else (resolution,)
+    while True:
+        grid = replace(RadianceGrid.from_function(field, box, resolution=counts[0], name=name), metres=metres)
         low, high = grid.bounds
         places = low + (high - low) * rng.random((PROBES, 3))
         wanted, got = np.asarray(field(places)[0], dtype=np.float64), grid.densities(places)
-        if np.abs(np.exp(-wanted * grid.spacing) - np.exp(-got * grid.spacing)).mean() < ROUGH:
-            break
-    return grid
+        error = np.abs(np.exp(-wanted * grid.spacing) - np.exp(-got * grid.spacing)).mean()
+        if error < ROUGH or len(counts) == 1:
+            return grid
+        counts = counts[1:]
 
 
 def _found_box(field: Field, name: str) -> Array:

@@ -200,12 +200,13 @@ def _solid(occupancy: Array, fill_voids: bool) -> tuple[Array, float, dict[str, 
         whole: Any = ndimage.binary_fill_holes(main) if fill_voids else main
         return main, whole, float(mass.max() / mass.sum())
 
-    fog: dict[float, float] = {}
-    for share in LEVELS:
-        main, whole, largest = found(share)
-        fog[share] = float(found(0.5 * share)[1].sum() / whole.sum()) - 1.0
-        if fog[share] < FOGGY:
-            break
+    def grows(share: float) -> float:
+        """Return the share of volume that half a level adds."""
+        return float(found(0.5 * share)[1].sum() / found(share)[1].sum()) - 1.0
+
+    fog = grows(LEVELS[0])
+    share = LEVELS[0] if fog < FOGGY else next((s for s in LEVELS[1:] if grows(s) < FOGGY), LEVELS[-1])
+    main, whole, largest = found(share)
     level = share * full
     void = whole & ~main
     near: Any = ndimage.binary_dilation(whole, np.ones((3, 3, 3)))
@@ -216,7 +217,7 @@ def _solid(occupancy: Array, fill_voids: bool) -> tuple[Array, float, dict[str, 
     return solid, level, {
         "level": level,
         "level_share": share,
-        "fog": fog[LEVELS[0]],
+        "fog": fog,
         "detached_share": 1.0 - largest,
         "filled_share": float(void.sum() / whole.sum()),
     }  # fmt: skip
