@@ -162,6 +162,7 @@ def test_constraints(iteration: int, memory: str, pins: int) -> None:
         "stiffness": rng.uniform(10.0, 1000.0, shape),
         "dent_compliance": rng.uniform(0.0, 0.1, shape) * (rng.random(shape) < 0.7),
         "dent_depth": rng.uniform(0.0, 2.0 * length, shape),
+        "onset": rng.uniform(0.3 * length, 3.0 * length, shape),
         "friction": rng.uniform(0.0, 1.0, shape) * (rng.random(shape) < 0.8),
         "stick": stick,
         "normal_force": rng.uniform(0.0, 0.1, shape),

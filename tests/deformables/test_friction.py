@@ -154,7 +154,11 @@ def test_carried_on_a_free_body():
 
 
 def test_force_stays_in_the_cone():
-    """|f_t| <= mu f_n in every contact of every step, sticking and sliding; and it opposes the slip."""
+    """|f_t| <= mu f_n in every contact of every step, sticking and sliding; and it opposes the slip.
+
+    The f_n of friction is that of the contact to rounding, but in the first step, which needs ten iterations: it is
+    frozen after eight.
+    """
     scene, along = incline(1.5)
     seen = 0
     for _ in range(60):
@@ -166,8 +170,8 @@ def test_force_stays_in_the_cone():
         tangential = np.linalg.norm(f - normal[:, None] * n, axis=1)
         lagged = entries.normal_force.numpy()[0, :count]
         assert (tangential <= MU * lagged * (1 + 1e-9)).all()
-        # it follows the contact for eight iterations, in most steps to the end
-        np.testing.assert_allclose(lagged, normal, atol=1e-4 * scene.mass() * GRAVITY)
+        frozen = scene.reduced.iteration.numpy()[0] > SolverReducedOptions().friction_lag
+        np.testing.assert_allclose(lagged, normal, atol=(2e-4 if frozen else 1e-6) * scene.mass() * GRAVITY)
         assert (f @ along <= 1e-9).all()
         seen += int((normal > 0).sum())
     assert seen > 100
@@ -269,7 +273,7 @@ def test_stick_is_the_return_map():
     count = int(entries.count.numpy()[0])
     f, k = entries.force.numpy()[0, :count], entries.stick.numpy()[0, :count]
     shapes, points = memory(scene)
-    rows = entries.row.numpy()[0, :count]
+    rows = entries.partner_row.numpy()[0, :count]
     held = (f**2).sum(axis=1) > 0.0
     world = points[rows, 0] @ rotation((0, 1, 0), np.arctan(1.5 * MU)).T
     n = entries.normal.numpy()[0, :count]
