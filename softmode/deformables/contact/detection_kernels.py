@@ -621,6 +621,7 @@ def gather_contacts(
         constraints.onset[i, e] = cell.onset
         constraints.anchor[i, e] = anchor
         stick = stick_ratio * wp.float64(shear * area)
+        constraints.stick_deep[i, e] = stick
         constraints.stick[i, e] = stick / (wp.float64(1.0) + stick * shear_yield(instances, i, compliance))
         constraints.stiffness[i, e] = stiffness
         constraints.dent_compliance[i, e] = compliance

@@ -40,6 +40,7 @@ from softmode.deformables.contact.penalty_kernels import (
     SHEAR_FACTOR,
     dent_compliance,
     dent_depth,
+    elastic_slip,
     shear_yield,
     stiffness_per_area,
 )
@@ -554,6 +555,7 @@ def write_pairs(
     compliance = wi + wj
     cell = cell_at(mine, F_own, n, pairs.gap[i, s, slot], wp.float64(0.0), stiffness * compliance)
     stick = stick_ratio * shear
+    deep = stick
     stick = stick / (wp.float64(1.0) + stick * (shear_yield(instances, i, wi) + shear_yield(instances, j, wj)))
     pairs.share[i, s, slot] = float(wi / wp.max(compliance, wp.float64(1.0e-30)))
     thick = wp.max(instances.scale[i] * pairs.thickness[own], instances.scale[j] * pairs.thickness[at])
@@ -591,6 +593,7 @@ def write_pairs(
             constraints.offset[a, e] = direction * offset
             constraints.stiffness[a, e] = stiffness
             constraints.stick[a, e] = stick
+            constraints.stick_deep[a, e] = deep
             constraints.dent_compliance[a, e] = compliance
             constraints.dent_depth[a, e] = wp.float64(depth) + HARDENING_DEPTH * mine.least
             constraints.onset[a, e] = cell.onset
@@ -627,11 +630,12 @@ def remember_pairs(
             continue
         limit = constraints.friction[i, e] * constraints.normal_force[i, e]
         total = constraints.slip[i, e]
-        stretch = constraints.stick[i, e] * wp.length(total)
-        if not (limit > wp.float64(0.0) and stretch > wp.float64(0.0) and wp.isfinite(stretch + limit)):
+        slid = wp.length(total)
+        most = elastic_slip(limit, constraints.stick[i, e], constraints.stick_deep[i, e], constraints.dent_depth[i, e])
+        if not (most > wp.float64(0.0) and slid > wp.float64(0.0) and wp.isfinite(slid + most)):
             continue
         F = gradient_of(instances, basis, motion.q_start, i, instances.row_start[i] + s)
-        elastic = clamped_inverse(F, instances.scale[i]) * (wp.min(wp.float64(1.0), limit / stretch) * total)
+        elastic = clamped_inverse(F, instances.scale[i]) * (wp.min(wp.float64(1.0), most / slid) * total)
         partner[slot] = pairs.other[i, s, slot] - state.instance_start[instances.world[i]]
         slips[slot] = elastic
     particle = instances.particle_start[i] + s

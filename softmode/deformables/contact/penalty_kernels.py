@@ -107,25 +107,49 @@ def friction_potential(y: wp.float64, eps: wp.float64):
 
 
 @wp.func
-def stick_potential(y: wp.float64, limit: wp.float64, stiffness: wp.float64):
+def elastic_slip(force: wp.float64, stiffness: wp.float64, deep: wp.float64, depth: wp.float64):
+    """Return the slip [m] at which the spring of friction has a force [N]; 0 of friction without memory."""
+    if stiffness <= wp.float64(0.0):
+        return wp.float64(0.0)
+    if force <= stiffness * depth:
+        return force / stiffness
+    return depth + (force - stiffness * depth) / deep
+
+
+@wp.func
+def stick_potential(y: wp.float64, limit: wp.float64, stiffness: wp.float64, deep: wp.float64, depth: wp.float64):
     """Return energy [J], force over slip and curvature along the slip [N/m] of elastic-plastic friction at slip y [m].
 
-    A spring up to the force ``limit`` [N], constant force beyond; nothing where the limit is 0.
+    A spring up to the force ``limit`` [N], constant force beyond; nothing where the limit is 0. It has the stiffness
+    ``deep`` from the slip ``depth`` [m] on: the dent gives no more along the surface than across.
     """
     zero = wp.float64(0.0)
     half = wp.float64(0.5)
     if limit <= zero:
         return zero, zero, zero
-    if stiffness * y <= limit:
-        return half * stiffness * y * y, stiffness, stiffness
-    return limit * (y - half * limit / stiffness), limit / y, zero
+    most = elastic_slip(limit, stiffness, deep, depth)
+    x = wp.min(y, most)
+    over = wp.max(x - depth, zero)
+    energy = half * stiffness * x * x + half * (deep - stiffness) * over * over + limit * (y - x)
+    if y > most:
+        return energy, limit / y, zero
+    if over > zero:
+        return energy, stiffness + (deep - stiffness) * over / y, deep
+    return energy, stiffness, stiffness
 
 
 @wp.func
-def slip_potential(y: wp.float64, limit: wp.float64, stick: wp.float64, stick_range: wp.float64):
+def slip_potential(
+    y: wp.float64,
+    limit: wp.float64,
+    stick: wp.float64,
+    deep: wp.float64,
+    depth: wp.float64,
+    stick_range: wp.float64,
+):
     """Return energy [J], force over slip and curvature along the slip [N/m] of friction, with memory or smoothed."""
     if stick > wp.float64(0.0):
-        return stick_potential(y, limit, stick)
+        return stick_potential(y, limit, stick, deep, depth)
     f0, secant, tangent = friction_potential(y, stick_range)
     return limit * f0, limit * secant, limit * tangent
 

@@ -135,6 +135,7 @@ def contact_at(
         constraints.dent_depth[i, e],
         constraints.friction[i, e],
         constraints.stick[i, e],
+        constraints.stick_deep[i, e],
         constraints.normal_force[i, e],
         constraints.onset[i, e],
         stick_range,

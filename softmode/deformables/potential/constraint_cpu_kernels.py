@@ -52,7 +52,7 @@ _EVALUATE = """
     const double* const normals = (const double*)constraints.normal.data + 3 * own;
     const double* const offsets = (const double*)constraints.offset.data + 3 * own;
     wp::vec_t<3, lanes> n, offset, d;
-    lanes stiffness, compliance, depth, friction, stick, held, onset;
+    lanes stiffness, compliance, depth, friction, stick, deep, held, onset;
     words pinned;
     for (int k = 0; k < 8; ++k) {
         const size_t one = own + at[k];
@@ -63,6 +63,7 @@ _EVALUATE = """
         onset[k] = constraints.onset.data[one];
         friction[k] = constraints.friction.data[one];
         stick[k] = constraints.stick.data[one];
+        deep[k] = constraints.stick_deep.data[one];
         held[k] = constraints.normal_force.data[one];
         for (int axis = 0; axis < 3; ++axis) {
             n.c[axis][k] = normals[3 * at[k] + axis];
@@ -71,7 +72,7 @@ _EVALUATE = """
         }
     }
     const Law::contact_response_results found = Law::contact_response(
-        pinned, offset, n, d, stiffness, compliance, depth, friction, stick, held, onset, stick_range, mode, exact);
+        pinned, offset, n, d, stiffness, compliance, depth, friction, stick, deep, held, onset, stick_range, mode, exact);
     double* const slips = (double*)constraints.slip.data + 3 * own;
     double* const forces = (double*)constraints.force.data + 3 * own;
     for (int k = 0; k < count; ++k) {

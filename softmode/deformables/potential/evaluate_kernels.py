@@ -173,6 +173,7 @@ def evaluate_constraint(
         step.constraints.dent_depth[i, e],
         step.constraints.friction[i, e],
         step.constraints.stick[i, e],
+        step.constraints.stick_deep[i, e],
         step.constraints.normal_force[i, e],
         step.constraints.onset[i, e],
         step.options.stick_range,
