@@ -210,9 +210,15 @@ def friction_potential(y: np.ndarray, eps: float) -> np.ndarray:
     return np.where(y < eps, y * y / eps - y**3 / (3 * eps**2) + eps / 3, y)
 
 
-def stick_potential(y: np.ndarray, limit: float, stiffness: float) -> np.ndarray:
-    """Return the energy [J] of a spring that slips at the force limit: k y^2 / 2, then limit (y - limit / (2 k))."""
-    return np.where(stiffness * y <= limit, 0.5 * stiffness * y * y, limit * (y - 0.5 * limit / stiffness))
+def stick_potential(y: np.ndarray, limit: float, stiffness: float, deep: float, depth: float) -> np.ndarray:
+    """Return the energy [J] of a spring that slips at the force limit: the integral of min(force, limit).
+
+    The force is k y up to a tenth of the dent, and grows by ``deep`` from there on.
+    """
+    bend = 0.1 * depth
+    most = limit / stiffness if limit <= stiffness * bend else bend + (limit - stiffness * bend) / deep
+    x = np.minimum(y, most)
+    return 0.5 * stiffness * x**2 + 0.5 * (deep - stiffness) * np.maximum(x - bend, 0.0) ** 2 + limit * (y - x)
 
 
 def contact_stiffness(

@@ -165,6 +165,7 @@ def test_constraints(iteration: int, memory: str, pins: int) -> None:
         "onset": rng.uniform(0.3 * length, 3.0 * length, shape),
         "friction": rng.uniform(0.0, 1.0, shape) * (rng.random(shape) < 0.8),
         "stick": stick,
+        "stick_deep": stick * rng.uniform(1.0, 20.0, shape),
         "normal_force": rng.uniform(0.0, 0.1, shape),
         "dof_begin": rng.integers(0, 3, shape),
         "dof_end": rng.integers(2, 7, shape),

@@ -25,24 +25,30 @@ ShapeConfig = newton.ModelBuilder.ShapeConfig
 # -- the potential -----------------------------------------------------------------------------------------------------
 
 
-def test_stick_potential():
-    """A spring up to the limit, linear beyond; slope = secant * y; a continuous force, never above the limit."""
+@pytest.mark.parametrize("depth", [1.0, 1.0e-3], ids=["soft", "used up"])
+def test_stick_potential(depth):
+    """A spring up to the limit, linear beyond; slope = secant * y; a continuous force, never above the limit.
+
+    Where the dent along the surface is used up, a tenth of ``depth``, the spring is five times as stiff.
+    """
     limit, stiffness, step = 0.3, 2.0e3, 1.0e-9
+    spring = (stiffness, 5.0 * stiffness, depth)
     y = np.linspace(step, 4.0 * limit / stiffness, 400)
 
     def evaluate(values, limit=limit):
         with wp.ScopedDevice("cpu"):
             out = wp.zeros(len(values), dtype=wp.vec3d)
-            inputs = [wp.array(values, dtype=wp.float64), wp.float64(limit), wp.float64(stiffness)]
+            inputs = [wp.array(values, dtype=wp.float64), *map(wp.float64, (limit, *spring))]
             wp.launch(evaluate_stick, dim=len(values), inputs=inputs, outputs=[out])
         return out.numpy()
 
     value = evaluate(y)
-    np.testing.assert_allclose(value[:, 0], reference.stick_potential(y, limit, stiffness), rtol=1e-12)
+    np.testing.assert_allclose(value[:, 0], reference.stick_potential(y, limit, *spring), rtol=1e-12)
     slope = (evaluate(y + step)[:, 0] - evaluate(y - step)[:, 0]) / (2 * step)
     np.testing.assert_allclose(value[:, 1] * y, slope, atol=1e-5 * limit)
     assert (value[:, 1] * y).max() == pytest.approx(limit)
-    np.testing.assert_array_equal(value[:, 2], np.where(y * stiffness <= limit, stiffness, 0.0))
+    tangent = np.where(y <= 0.1 * depth, stiffness, 5.0 * stiffness)
+    np.testing.assert_array_equal(value[:, 2], np.where(value[:, 1] * y < (1.0 - 1e-12) * limit, tangent, 0.0))
     np.testing.assert_array_equal(evaluate(np.array([0.0, step]), limit=0.0), 0.0)
 
 

@@ -57,7 +57,7 @@ def contact_response(
         depth: Dent [m] from which on the contact hardens.
         friction: Coefficient of friction.
         stick: Stiffness of the spring of friction [N/m]; 0 for friction without memory.
-        deep: The same beyond a slip of ``depth`` [N/m].
+        deep: The same where the dent along the surface is used up [N/m].
         held: Normal force that friction went by [N].
         eps: Range of the onset [m].
         stick_range: That of friction without memory [m].

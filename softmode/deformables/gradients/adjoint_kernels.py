@@ -9,10 +9,12 @@ import warp as wp
 from softmode.deformables.contact.cell_kernels import Surface
 from softmode.deformables.contact.detection_kernels import Shapes, shape_area, shape_frame
 from softmode.deformables.contact.penalty_kernels import (
+    ALONG,
     BULK_FACTOR,
     SHEAR_FACTOR,
     contact_potential,
     dent_exponents,
+    elastic_slip,
     friction_potential,
     penalty,
     shear_exponents,
@@ -58,7 +60,7 @@ class Linearised:
         wp.vec3d
     ]  # the loss by the memory that a contact begins the step with, shape's frame [1/m]
     contact_bar: wp.array2d[wp.vec3d]  # the loss by a contact's displacement [1/m], and
-    normal_bar: wp.array2d[wp.vec2d]  # by its normal force, by ln of its dent's compliance besides
+    normal_bar: wp.array2d[wp.vec3d]  # by its normal force, by ln of its dent's compliance and of its depth besides
     cell_gradient: wp.array2d[wp.mat33d]  # the loss by the gradient of a cell ahead, and
     cell_place: wp.array2d[wp.vec3d]  # by the sample's place ahead [1/m]
     cell_spared: wp.array2d[wp.float64]  # by the share of the neighbourhood that does not touch
@@ -216,11 +218,12 @@ def place_constraints(
     c = constraints.friction[i, e]
     stick = constraints.stick[i, e]
     limit = c * k * slope
-    _energy, secant, tangent = slip_potential(y, limit, stick, stick_range)
+    deep = constraints.stick_deep[i, e]
+    _energy, secant, tangent = slip_potential(y, limit, stick, deep, constraints.dent_depth[i, e], stick_range)
     _f0, by_limit, _f1_slope = friction_potential(y, stick_range)
     if stick > wp.float64(0.0):
         by_limit = wp.float64(0.0)
-        if stick * y > limit:
+        if tangent == wp.float64(0.0) and y > wp.float64(0.0):
             by_limit = wp.float64(1.0) / y
     N = wp.outer(n, n)
     slip = secant * (identity - N)
@@ -231,6 +234,12 @@ def place_constraints(
     by_ratio = -ratio / ((wp.float64(1.0) + ratio) * (wp.float64(1.0) + ratio)) * plain_slope
     step.constraint_gain[i, e] = k * wp.vec2d(slope + by_ratio, by_ratio)
     step.constraint_hessian[i, e] = k * curvature * N + slip - c * k * curvature * by_limit * wp.outer(t, n)
+
+
+@wp.func
+def soft_force(constraints: PointConstraints, i: int, e: int):
+    """Return the force [N] from which on the dent along the surface is used up."""
+    return constraints.stick[i, e] * ALONG * constraints.dent_depth[i, e]
 
 
 @wp.kernel
@@ -246,7 +255,8 @@ def pull_memory(
 ):
     """Take over what the next step feels of where the contacts stick.
 
-    A contact ends the step with the elastic slip -P f / k_t, P f the tangential force, whether it sticks or slides.
+    A contact ends the step with the elastic slip -y(|P f|) P f / |P f|, P f the tangential force and y
+    ``elastic_slip``, whether it sticks or slides.
     """
     i, e = wp.tid()
     if e >= constraints.count[i]:
@@ -260,6 +270,13 @@ def pull_memory(
             if next_sample[i, k] == constraints.partner_row[i, e] and next_shape[i, k] == shape:
                 g = wp.quat_rotate(rotation, step.memory_start[i, k])
                 memory = (g - wp.dot(n, g) * n) / constraints.stick[i, e]
+                force = constraints.force[i, e] - wp.dot(n, constraints.force[i, e]) * n
+                f = wp.length(force)
+                if f > soft_force(constraints, i, e):
+                    deep = constraints.stick_deep[i, e]
+                    slip = elastic_slip(f, constraints.stick[i, e], deep, constraints.dent_depth[i, e])
+                    memory *= constraints.stick[i, e] * slip / f
+                    memory += (wp.float64(1.0) / deep - slip / f) * wp.dot(g, force) / (f * f) * force
     step.memory[i, e] = memory
     step.constraint[i, e] = wp.transpose(step.constraint_hessian[i, e]) * memory
 
@@ -524,21 +541,31 @@ def accumulate_constraints(
     normal_gain = by[0] * stiffness_powers + by[1] * dent_powers
     # k_t is that of the spring of friction and of the dent along the surface in series
     yields = constraints.stick[i, e] * shear_yield(instances, i, constraints.dent_compliance[i, e])
-    shear_powers = (wp.float64(1.0) - yields) * stiffness_exponents(
-        instances, i, SHEAR_FACTOR, relative, partner_area, dt
-    ) - yields * (dent_powers + shear_exponents(instances, i))
-    # what a contact remembers is its tangential force over k_t; the force of one that sticks is k_t times its slip
+    deep_powers = stiffness_exponents(instances, i, SHEAR_FACTOR, relative, partner_area, dt)
+    shear_powers = deep_powers - yields * (deep_powers + dent_powers + shear_exponents(instances, i))
+    # what a contact remembers is its elastic slip under the tangential force; that of one that sticks is by its slip
     force = constraints.force[i, e]
     along = force - wp.dot(constraints.normal[i, e], force) * constraints.normal[i, e]
     limit = constraints.friction[i, e] * wp.length(force - along)
-    stuck = constraints.stick[i, e] > none and constraints.stick[i, e] * wp.length(constraints.slip[i, e]) <= limit
-    by_shear = wp.dot(step.memory[i, e], along)
+    stick = constraints.stick[i, e]
+    deep = constraints.stick_deep[i, e]
+    depth = constraints.dent_depth[i, e]
+    felt = step.memory[i, e]
     L -= step.memory[i, e]
+    if stick > none and wp.length(constraints.slip[i, e]) <= elastic_slip(limit, stick, deep, depth):
+        felt += L
     by_normal = wp.dot(L, step.constraint_normal[i, e])
-    if stuck:
-        by_shear += wp.dot(L, along)
-    sums.contact[i, e] = sums.contact[i, e] + by_normal * normal_gain + by_shear * shear_powers
-    step.normal_bar[i, e] = wp.vec2d(by_normal, by_normal * by[1] - by_shear * yields)
+    by_shear = wp.dot(felt, along)
+    by_deep = none
+    by_depth = none
+    soft = soft_force(constraints, i, e)
+    if wp.length(along) > soft:
+        share = soft / wp.length(along)
+        by_deep = (wp.float64(1.0) - share) * by_shear
+        by_shear *= share
+        by_depth = (wp.float64(1.0) - deep / stick) * by_shear
+    sums.contact[i, e] = sums.contact[i, e] + by_normal * normal_gain + by_shear * shear_powers + by_deep * deep_powers
+    step.normal_bar[i, e] = wp.vec3d(by_normal, by_normal * by[1] - by_shear * yields, by_depth)
     # of x = gap n + slip - drift + d, the gap grows along n as the sample's place at the start does, d falls by as much
     # as that, and the drift of a shape that turns by R within the step grows by R - I of it
     n = constraints.normal[i, e]

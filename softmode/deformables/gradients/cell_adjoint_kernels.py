@@ -140,7 +140,7 @@ def accumulate_cells(
     onset_bar = HARDENING_RANGE * HARDENING * by_onset(p - depth, deep)
     onset_bar = force_bar * (onset_bar + share * by_onset(p, eps))
     lead_bar = force_bar * (share * curvature + steep)
-    depth_bar = -force_bar * steep * depth
+    depth_bar = step.normal_bar[i, e][2] - force_bar * steep * depth
 
     start = gradient_of(instances, basis, motion.q_start, i, row)
     ahead, closing = ahead_of(instances, basis, motion, start, n, i, row, dt)
@@ -182,7 +182,7 @@ def accumulate_cells(
     by_log = by_ratio * ratio
     spared_bar = zero
     if spared > zero:
-        own = depth_bar + force_bar * steep * HARDENING_DEPTH * cell_shape.least  # less the part that no dent shifts
+        own = depth_bar * (wp.float64(1.0) - HARDENING_DEPTH * cell_shape.least / depth)  # a part no dent shifts
         spared_bar = (step.normal_bar[i, e][1] + own + by_log) / spared
         spared_bar *= wp.float64(2.0) * wp.sqrt(wp.max(wp.float64(1.0) - spared, zero))  # by -c
     step.cell_spared[i, e] = spared_bar

@@ -126,7 +126,7 @@ class PointConstraints:
     lead: wp.array2d[wp.float64]  # how much earlier than the sample its cell begins to touch [m]
     friction: wp.array2d[wp.float64]
     stick: wp.array2d[wp.float64]  # tangential stiffness of a contact with memory [N/m]; 0: smoothed Coulomb friction
-    stick_deep: wp.array2d[wp.float64]  # the same beyond a slip of ``dent_depth`` [N/m]
+    stick_deep: wp.array2d[wp.float64]  # the same where the dent along the surface is used up [N/m]
     anchor: wp.array2d[wp.vec3d]  # where the sample stuck at the start of the step, in the shape's frame [m]
     displacement: wp.array2d[wp.vec3d]  # of the last evaluation, relative to the other side [m]
     slip: wp.array2d[wp.vec3d]  # tangential displacement, that of the memory included [m]

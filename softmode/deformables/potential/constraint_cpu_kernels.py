@@ -72,7 +72,8 @@ _EVALUATE = """
         }
     }
     const Law::contact_response_results found = Law::contact_response(
-        pinned, offset, n, d, stiffness, compliance, depth, friction, stick, deep, held, onset, stick_range, mode, exact);
+        pinned, offset, n, d, stiffness, compliance, depth, friction, stick, deep, held, onset, stick_range, mode,
+        exact);
     double* const slips = (double*)constraints.slip.data + 3 * own;
     double* const forces = (double*)constraints.force.data + 3 * own;
     for (int k = 0; k < count; ++k) {
