@@ -553,13 +553,13 @@ def accumulate_constraints(
     felt = step.memory[i, e]
     L -= step.memory[i, e]
     if stick > none and wp.length(constraints.slip[i, e]) <= elastic_slip(limit, stick, deep, depth):
-        felt += L
+        felt = felt + L
     by_normal = wp.dot(L, step.constraint_normal[i, e])
     by_shear = wp.dot(felt, along)
     by_deep = none
     by_depth = none
     soft = soft_force(constraints, i, e)
-    if wp.length(along) > soft:
+    if stick > none and wp.length(along) > soft:
         share = soft / wp.length(along)
         by_deep = (wp.float64(1.0) - share) * by_shear
         by_shear *= share
