@@ -95,8 +95,8 @@ def slope_of_touching(y: wp.float64):
     return wp.float64(6.0) * y * (wp.float64(1.0) - y)
 
 
-# Warp writes the adjoints of what ``wp.grad`` calls only if nothing in the module called it before, and takes kernels in
-# the order of their hashes: so this one has a module of its own, and ``wp.grad`` comes first in it.
+# Warp writes the adjoints of what ``wp.grad`` calls only if nothing in the module called it before, and takes kernels
+# in the order of their hashes: so this one has a module of its own, and ``wp.grad`` comes first in it.
 @wp.kernel(module="unique", enable_backward=False)
 def accumulate_cells(
     instances: Instances,
