@@ -16,6 +16,7 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull, KDTree
 
 from softmode.deformables.quadrature.shell_views import spread_samples
+from softmode.splats.components import surface_discs
 from softmode.splats.splats import Splats
 
 Array = NDArray[np.float64]
@@ -49,7 +50,7 @@ class Surface:
     @classmethod
     def of(cls, splats: Splats) -> Surface:
         """Return the discs of splats."""
-        points, (normals, tangents) = splats.means.astype(np.float64), splats.discs()
+        points, (normals, tangents) = splats.means.astype(np.float64), surface_discs(splats)
         areas = splats.opacities * np.linalg.norm(tangents, axis=1).prod(axis=1)
         few: Any = KDTree(points).query(points[:: max(1, len(points) // 20_000)], k=min(7, len(points)))
         return cls(
@@ -257,16 +258,20 @@ class Sections:
         return found / len(rows)
 
     def tops(self) -> list[Boundary]:
-        """Return the level tops on which something stands, first the narrow ones, then those of rough surfaces."""
+        """Return the level tops on which something stands, those of rough surfaces where no narrow one is likely."""
         found: list[Boundary] = []
         for reach in (1, 3):
             apart: list[int] = []
             for k, below, _, cover in sorted(self._levels(reach), key=lambda top: -top[3] * top[2]):
                 if all(abs(k - other) > 2 * reach + 1 for other in apart):
                     apart.append(k)
-                    if all(abs(k - self.layer_of(other.height)) > 4 for other in found):
+                    if all(abs(k - self.layer_of(other.height)) > 4 or other.score < LIKELY for other in found):
                         found += self._scored(k, reach, below, cover)
-        return found
+        best: list[Boundary] = []
+        for top in sorted(found, key=lambda top: -top.score):
+            if all(abs(top.height - other.height) > 4.5 * self.layer for other in best):
+                best.append(top)
+        return best
 
     def _levels(self, reach: int) -> list[tuple[int, Mask, int, float]]:
         """Return heights with more below than above: layer, outline below, cells free, and their level share."""

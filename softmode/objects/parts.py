@@ -8,12 +8,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
-from scipy.spatial import KDTree
+from scipy.spatial import ConvexHull, KDTree
 
 from softmode.errors import ConfigError
 from softmode.objects.carrier_cut import WHOLE, divide
 from softmode.objects.rooms import crop_of, scene_crop
-from softmode.splats.components import label_components, size_of
+from softmode.splats.components import label_components, size_of, surface_discs
 from softmode.splats.splats import Splats, joined
 
 Rule = Literal["thickest", "tallest", "largest", "all"]
@@ -23,6 +23,8 @@ GROUND_SHARE = 0.05
 """Least share of a capture's area that can be ground."""
 GROUND_COVER = 0.5
 """Of ground less than this has anything above it: the side of a solid has the other side behind it."""
+GROUND_UNDER = 0.5
+"""Of all else at least this lies over the ground."""
 SURROUNDED = 0.05
 """A part with this share of another's splats, in the middle of it, is the object and the other one a room."""
 CANDIDATES = 9
@@ -144,7 +146,7 @@ def find_ground(splats: Splats) -> Ground | None:
     if len(solid) < 200:
         return None
     firm = splats.subset(solid)
-    x, size, (normal, tangents) = firm.means.astype(np.float64), size_of(firm), firm.discs()
+    x, size, (normal, tangents) = firm.means.astype(np.float64), size_of(firm), surface_discs(firm)
     area = np.linalg.norm(tangents, axis=1).prod(axis=1)
     area = np.minimum(area, np.quantile(area, 0.99))
     few = np.random.default_rng(0).permutation(len(solid))[:3000]
@@ -174,6 +176,11 @@ def find_ground(splats: Splats) -> Ground | None:
     side = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
     side /= np.linalg.norm(side)
     plan = (x - middle) @ np.stack([side, np.cross(axis, side)], axis=1)
+    # What stands on it stands over it: else it is a strip of a round side.
+    hull = ConvexHull(plan[flat])
+    within = (plan[rest] @ hull.equations[:, :2].T + hull.equations[:, 2]).max(axis=1) < 0.0
+    if within.mean() < GROUND_UNDER:
+        return None
     # Cells that hold ten splats of the plane on average; holes between them do not count.
     cell = max(float(np.sqrt(10.0 * np.ptp(plan[flat], axis=0).prod() / flat.sum())), 0.01 * size)
     edges = [np.arange(along.min(), along.max() + cell, cell) for along in plan.T]
