@@ -258,20 +258,16 @@ class Sections:
         return found / len(rows)
 
     def tops(self) -> list[Boundary]:
-        """Return the level tops on which something stands, those of rough surfaces where no narrow one is likely."""
+        """Return the level tops on which something stands, first the narrow ones, then those of rough surfaces."""
         found: list[Boundary] = []
         for reach in (1, 3):
             apart: list[int] = []
             for k, below, _, cover in sorted(self._levels(reach), key=lambda top: -top[3] * top[2]):
                 if all(abs(k - other) > 2 * reach + 1 for other in apart):
                     apart.append(k)
-                    if all(abs(k - self.layer_of(other.height)) > 4 or other.score < LIKELY for other in found):
+                    if all(abs(k - self.layer_of(other.height)) > 4 for other in found):
                         found += self._scored(k, reach, below, cover)
-        best: list[Boundary] = []
-        for top in sorted(found, key=lambda top: -top.score):
-            if all(abs(top.height - other.height) > 4.5 * self.layer for other in best):
-                best.append(top)
-        return best
+        return found
 
     def _levels(self, reach: int) -> list[tuple[int, Mask, int, float]]:
         """Return heights with more below than above: layer, outline below, cells free, and their level share."""
