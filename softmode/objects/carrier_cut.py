@@ -85,7 +85,9 @@ def cut_at(sections: Sections, boundary: Boundary, gap: float) -> Cut:
     lying = (np.abs(height) <= reach) & (np.abs(normal[:, 2]) > 0.75)
     if rough:
         core: Any = ndimage.binary_erosion(contact, iterations=2)
-        sheet = _sheet(surface, height, span, ~within[i, j])
+        covered = sections.solid[sections.layer_of(boundary.height + 2.0 * span) :].any(axis=0)
+        low = (np.abs(height) < 2.0 * span) & (np.abs(normal[:, 2]) > 0.8) & ~covered[i, j]
+        sheet = _sheet(surface, np.flatnonzero(low), outside)
         lying = (lying & ~(core[i, j] & (height > 0.3 * reach))) | sheet
         foot, stands = np.zeros_like(contact), above & ~sheet & (height < 2.0 * span)
         foot[i[stands], j[stands]] = True
@@ -107,15 +109,14 @@ def cut_at(sections: Sections, boundary: Boundary, gap: float) -> Cut:
     return Cut(above=above, beneath=beneath, floor=place, cell=sections.cell, axis=sections.basis[2])
 
 
-def _sheet(surface: Surface, height: Array, span: float, outside: Mask) -> Mask:
+def _sheet(surface: Surface, level: NDArray[np.intp], outside: Mask) -> Mask:
     """Return which splats belong to an uneven top: level ones that hang together with those outside the contact.
 
     A bump that touches what stands there is part of it; a foot is not, whose sides are steep.
     """
-    level = np.flatnonzero((np.abs(height) < 2.0 * span) & (np.abs(surface.normals[:, 2]) > 0.8))
     label = link_labels(surface.points[level], 1.2 * surface.pitch)
     free = np.bincount(label, surface.areas[level] * outside[level])
-    found = np.zeros(len(height), dtype=bool)
+    found = np.zeros(len(outside), dtype=bool)
     found[level] = (free >= 0.2 * free.sum())[label]
     return found
 
