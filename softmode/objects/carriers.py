@@ -370,7 +370,7 @@ def is_step(sections: Sections, lower: Boundary, upper: Boundary) -> bool:
     first, last = sections.layer_of(lower.height), sections.layer_of(upper.height)
     between = [convexity(mask) for mask in sections.solid[first + 3 : last - 2] if mask.any()]
     convex = float(np.median(between)) if between else 0.0
-    if last - first < 10:
+    if last - first < 0.25 * len(sections.solid):  # the faces of a low step may be too bare for sections
         convex = max(convex, upper.convexity)
     plain, _, _ = sections.look(lower.height + sections.layer, upper.height + sections.layer)
     return convex > 0.8 and plain > 0.6 and plain - upper.plain_above > 0.15
