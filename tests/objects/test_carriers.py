@@ -5,8 +5,11 @@ Builds captures, which is what it tests.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from benchmarks.carriers import SEEDS, judge
 from softmode.deformables.quadrature.quadrature import quadrature_from_splats
@@ -58,13 +61,22 @@ def test_a_room_is_named() -> None:
 
 
 def test_the_fullest_of_two_planes_is_the_ground() -> None:
-    """Of a wide sheet and a smaller one a little above it, only the wide one is the ground."""
+    """Of a wide sheet and a smaller one a little above it, only the wide one is the ground; so it is of spheres."""
     wide, small = sheet(0.5, 0.5, 3e-3), sheet(0.16, 0.16, 3e-3, seed=1).transformed(translation=(0.0, 0.0, 6e-3))
     thing = render_shell(toy(), 4000).transformed(translation=(0.0, 0.0, 6e-3))
-    ground = find_ground(merged(wide, small, thing))
-    assert ground is not None and ground.normal[2] == pytest.approx(1.0, abs=1e-3)
-    assert ground.splats[: wide.count].mean() > 0.95
-    assert ground.splats[wide.count : wide.count + small.count].mean() < 0.05
+    scene = merged(wide, small, thing)
+    radius = np.sort(scene.scales, axis=1)[:, 1:2]
+    spheres = replace(scene, scales=np.repeat(radius, 3, axis=1), quats=Rotation.random(scene.count, 0).as_quat())
+    for seen in (scene, spheres):
+        ground = find_ground(seen)
+        assert ground is not None and ground.normal[2] == pytest.approx(1.0, abs=1e-3)
+        assert ground.splats[: wide.count].mean() > 0.95
+        assert ground.splats[wide.count : wide.count + small.count].mean() < 0.05
+
+
+def test_a_strip_of_a_round_side_is_no_ground() -> None:
+    """All of a bell lies on one side of a strip of it, but not over it."""
+    assert find_ground(bare(7, count=FEW).splats) is None
 
 
 def test_bad_captures_are_refused() -> None:
