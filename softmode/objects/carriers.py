@@ -330,6 +330,8 @@ class Sections:
         }
         # A boxy thing on a box may be the hood of a car: a doubt is named.
         score = min(float(np.prod(list(why.values()))), 0.99 * SURE if plain_above > 0.9 else 1.0)
+        if score < LIKELY and np.prod([part for name, part in why.items() if name != "free"]) > 0.9:
+            score = max(score, 1.5 * DOUBTED * ramp(around + 0.3 * contrast, 0.55, 0.65))  # all else speaks for it
         named = {"convexity": convex, "plain_above": plain_above}
         top = Boundary(kind="top", height=float(self.heights[k]), score=score, contact=above, reach=reach, **named)
         return [top]

@@ -19,7 +19,7 @@ from softmode.objects.parts import choose_part, find_ground
 from softmode.objects.pipeline import standing_quadrature
 from softmode.objects.source import object_source
 from tests.captures import merged, render_shell, sheet, toy
-from tests.carriers import CARRIER, OBJECT, SETS, bare, carried, room
+from tests.carriers import CARRIER, OBJECT, SETS, bare, bear, box, carried, render, room, vase
 
 FEW = 8_000
 """Splats of a capture in the quick tests."""
@@ -50,6 +50,24 @@ def test_a_block_with_a_handle_stays_whole() -> None:
     choice = choose_part(made.splats, "thickest")
     assert "carrier" not in choice.told and choice.told["floor_splats"] == 0
     assert np.isin(choice.number, choice.taken)[made.label == OBJECT].mean() > 0.97
+
+
+def test_of_two_things_on_one_carrier_one_is_taken() -> None:
+    """A bear and a vase on a box: one of them, closed below, and the other as a candidate with a floor of its own."""
+    left, right, below = bear(), vase(), box(2.2, 1.2, 0.5, at=(0, 0, -0.25))
+    below.label = CARRIER
+    for shape, way in ((left, -0.6), (right, 0.6)):
+        for solid in shape:
+            solid.at[0] += way
+    made = render([*left, *right, below], "two", np.random.default_rng(6), count=2 * FEW)
+    one = choose_part(made.splats, "thickest")
+    other = choose_part(made.splats, (int(one.told["other_part"]),))
+    for choice in (one, other):
+        low, high = choice.part.bounds()[:, 0]
+        assert low > 0.0 or high < 0.0
+        assert int(choice.told["floor_splats"]) > 0
+        assert (made.label[choice.rows] == OBJECT).mean() > 0.99
+    assert len(one.rows) + len(other.rows) > 0.97 * (made.label == OBJECT).sum()
 
 
 def test_a_room_is_named() -> None:
