@@ -328,8 +328,9 @@ class Sections:
             "smaller": ramp(-float(above.sum() / below.sum()), -0.95, -0.85),
             "enough": ramp(share, 0.02, 0.06) * ramp(held, 0.01, 0.04) * ramp(most, 0.18, 0.35),
         }
-        # A boxy thing on a box may be the hood of a car: a doubt is named.
-        score = min(float(np.prod(list(why.values()))), 0.99 * SURE if plain_above > 0.9 else 1.0)
+        # A boxy thing on a box may be the hood of a car, and a slight foot that of a handle: a doubt is named.
+        unsure = plain_above > 0.9 or above.sum() < 0.03 * below.sum()
+        score = min(float(np.prod(list(why.values()))), 0.99 * SURE if unsure else 1.0)
         if score < LIKELY and np.prod([part for name, part in why.items() if name != "free"]) > 0.9:
             score = max(score, 1.5 * DOUBTED * ramp(around + 0.3 * contrast, 0.55, 0.65))  # all else speaks for it
         named = {"convexity": convex, "plain_above": plain_above}
@@ -359,7 +360,8 @@ class Sections:
                 "not turned": ramp(-self.turned_share, -0.85, -0.7),
                 "enough": ramp(float(self.areas[end:].sum() / self.areas.sum()), 0.1, 0.3),
             }
-            score, height = float(np.prod(list(why.values()))), float(self.heights[end])
+            # A mushroom stands on a stem of its own: a doubt is named.
+            score, height = min(float(np.prod(list(why.values()))), 0.99 * SURE), float(self.heights[end])
             found.append(Boundary(kind="stem", height=height, score=score, contact=self.solid[end]))
         return sorted(found, key=lambda stem: -stem.score)[:1]
 
