@@ -36,7 +36,7 @@ unexport PYTHONDONTWRITEBYTECODE
 unexport VIRTUAL_ENV
 
 .DEFAULT_GOAL := help
-.PHONY: help lock resolve demo test test-fast test-rest test-slow lint docs dist smoke bench accuracy baselines clean coupling
+.PHONY: help lock resolve demo test test-fast test-rest test-slow test-lowest test-lerobot lint docs dist smoke bench accuracy baselines clean coupling
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -94,6 +94,22 @@ test-rest: $(VENV)/.dev | $(WARP_CACHE_PATH)  ## run what `make test` leaves out
 
 test-slow: $(VENV)/.dev | $(WARP_CACHE_PATH)  ## run all tests, slow ones included
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(FILES) -m 'slow or not slow' $(ARGS)
+
+LOWEST := .venv-lowest
+test-lowest: $(VENV)/.dev | $(WARP_CACHE_PATH)  ## run the tests with the lowest versions that pyproject.toml allows
+	$(PYTHON) -m venv $(LOWEST)
+	$(LOWEST)/bin/python -m pip install --quiet '$(TORCH)'
+	$(UV) pip install --quiet --python $(LOWEST)/bin/python --resolution lowest-direct --editable '.[dev]'
+	OMP_NUM_THREADS=1 $(LOWEST)/bin/python -m pytest $(FILES) $(ARGS)
+
+# LeRobot asks for Python 3.12 and an older torch, and brings gigabytes.
+LEROBOT := .venv-lerobot
+LEROBOT_PYTHON ?= python3.12
+test-lerobot: $(VENV)/.created | $(WARP_CACHE_PATH)  ## record, train and evaluate with LeRobot, in an environment of its own
+	$(LEROBOT_PYTHON) -m venv $(LEROBOT)
+	$(UV) pip install --quiet --python $(LEROBOT)/bin/python --editable '.[data,demo]' \
+	  --editable packages/lerobot_env_softmode 'lerobot[dataset,training]==0.6.1' 'pytest>=8.3'
+	$(LEROBOT)/bin/python -m pytest -c packages/lerobot_env_softmode/pyproject.toml packages/lerobot_env_softmode/tests $(ARGS)
 
 lint: $(VENV)/.dev  ## ruff, pyright, words that may not come back, names of what is not there
 	$(BIN)/ruff check .

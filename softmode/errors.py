@@ -45,6 +45,10 @@ class ConfigError(SoftmodeError, ValueError):
     """An option or argument is unknown or outside its range."""
 
 
+class UnknownArgumentError(ConfigError, TypeError):
+    """A keyword argument is unknown; a `TypeError` as well, by which other libraries find out what they may give."""
+
+
 class GraspError(SoftmodeError, ValueError):
     """A gripper has no grasp of an object."""
 

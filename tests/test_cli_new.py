@@ -18,9 +18,9 @@ ROOT = Path(__file__).resolve().parents[1]
 
 @pytest.fixture(scope="module")
 def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the folder of a new task."""
+    """Return the folder of a new task, written into the working folder."""
     folder = tmp_path_factory.mktemp("new")
-    assert main(["new", "task", "SlideDisc", "--out", str(folder)]) == 0
+    assert "play slide_disc:slide_disc/SlideDisc-v0" in run(folder, "-m", "softmode", "new", "task", "SlideDisc")
     return folder / "slide_disc"
 
 

@@ -29,7 +29,7 @@ from softmode.deformables.quadrature.quadrature_grid import Quadrature
 from softmode.deformables.quadrature.quadrature_mesh import quadrature_from_mesh
 from softmode.deformables.reduction.build_body import build_body
 from softmode.deformables.reduction.cubature import select_cubature
-from softmode.deformables.reduction.functions import orthonormalise
+from softmode.deformables.reduction.functions import RawFunctions, affine_first, orthonormalise
 from softmode.deformables.reduction.options import BuildOptions
 from softmode.deformables.solver.options import Integrator, SolverReducedOptions
 from softmode.deformables.solver.solver_reduced import SolverReduced
@@ -130,9 +130,11 @@ def neural_body(options: NeuralWeightsOptions) -> NeuralBody:
     spread = np.linalg.eigvalsh((weight * mass[:, None]).T @ weight)
     raw, raw_gradient = _products(network, mean, mix, points, body.offset, body.length)
     skin = _skin(mix)
-    found = orthonormalise(
-        raw, raw_gradient, mass, mass, leading=skin.leading, kept=skin.translating, length=body.length
-    )
+    lead, others = skin.leading[[3, 0, 1, 2]], np.setdiff1d(np.flatnonzero(~skin.translating), skin.leading)
+    kept = np.flatnonzero(skin.translating)
+    fields = RawFunctions(raw, raw_gradient, mass, mass)
+    free = orthonormalise(fields, lead=np.eye(raw.shape[1])[:, lead], kept=kept, others=others)
+    found = affine_first(free, skin.leading, body.length)
     gradient = np.stack([raw_gradient[:, :, d] @ found.transform for d in range(3)], axis=2)
     chosen = select_cubature(quadrature.weights, gradient, body.point_count)
     fields = {f.name: getattr(body, f.name) for f in dataclasses.fields(body)}

@@ -38,10 +38,10 @@ class New:
     def run(self) -> int:
         """Write the package and say what to do next."""
         folder = write_task(self.name, self.out)
-        package, name = package_name(self.name), env_id(self.name)
-        print(f"{folder} is a package with the task {name}. Next:\n")
+        package = folder.name
+        print(f"{folder} is a package with the task {env_id(package)}. Next:\n")
         print(f"  cd {folder}\n  pip install -e '.[dev]'\n  python -m pytest")
-        print(f"  softmode play {package}:{name} --video out/{package}.mp4")
+        print(f"  softmode play {package}:{env_id(package)} --video out/{package}.mp4")
         return 0
 
 
@@ -64,9 +64,8 @@ def class_name(package: str) -> str:
     return "".join(part.capitalize() for part in package.split("_"))
 
 
-def env_id(name: str) -> str:
-    """Return the id of a task's environment: slide_disc/SlideDisc-v0."""
-    package = package_name(name)
+def env_id(package: str) -> str:
+    """Return the id of a package's environment: slide_disc/SlideDisc-v0."""
     return f"{package}/{class_name(package)}-v0"
 
 
@@ -92,7 +91,7 @@ def write_task(name: str, parent: Path) -> Path:
         "package": package,
         "project": package.replace("_", "-"),
         "Task": class_name(package),
-        "id": env_id(name),
+        "id": env_id(package),
         "version": __version__,
     }
     with storage_errors(folder):

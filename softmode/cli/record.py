@@ -59,6 +59,8 @@ class Record:
     demonstrations that show how to come back from errors."""
     states: bool = False
     """Record the state in which each episode begins, to begin episodes with."""
+    license: str | None = None
+    """License that the dataset's card names, such as apache-2.0; your own object may have one of its own."""
     append: bool = False
     """Add to the dataset in the folder, if there is one."""
     device: str | None = None
@@ -97,6 +99,7 @@ class Record:
             policy = policy_factory(self.policy, env, trained)
             features = environment_features(env, pictures=self.pictures)
             origin = {"env": self.env, "env_options": given}
+            origin |= {} if self.license is None else {"license": self.license}
             fps = int(env.metadata["render_fps"])
             robot = ROBOT if self.arm.robot is None else Path(self.arm.robot).stem
             with (

@@ -77,11 +77,16 @@ def environment_features(
             )
     return {
         **features,
-        "action": Feature(dtype="float32", shape=actions.shape),
+        "action": Feature(dtype="float32", shape=actions.shape, names=_action_names(task)),
         "next.reward": Feature(dtype="float32", shape=(1,)),
         "next.done": Feature(dtype="bool", shape=(1,)),
         "next.success": Feature(dtype="bool", shape=(1,)),
     }
+
+
+def _action_names(task: Any) -> tuple[str, ...] | None:
+    """Return a name for every number of an action, or None if the environment does not tell."""
+    return getattr(getattr(getattr(task, "scene", None), "controller", None), "action_names", None)
 
 
 def _names(task: object) -> tuple[str, ...] | None:

@@ -7,6 +7,7 @@ A dataset is a folder::
     meta/tasks.parquet                              task sentences and their numbers
     meta/episodes/chunk-000/file-000.parquet        one row per episode: where its frames are, its statistics
     meta/softmode.json                              where the episodes come from; not of the format
+    README.md                                       the card by which a hub shows the dataset
     data/chunk-000/file-000.parquet                 one row per frame
     videos/KEY/chunk-000/file-000.mp4               pictures, when they are stored as video
 
@@ -37,7 +38,7 @@ DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 EPISODES_PATH = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 INFO_PATH, STATISTICS_PATH, TASKS_PATH = "meta/info.json", "meta/stats.json", "meta/tasks.parquet"
-ORIGINS_PATH = "meta/softmode.json"
+ORIGINS_PATH, CARD_PATH = "meta/softmode.json", "README.md"
 STATE_PATH = "meta/states/episode-{number:06d}.npz"
 IMAGE_NAMES = ("height", "width", "channels")
 
@@ -46,6 +47,31 @@ def place_of(number: int) -> dict[str, int]:
     """Return the chunk of a file and its number within, by their names in the templates of paths."""
     chunk, within = divmod(number, CHUNK_SIZE)
     return {"chunk_index": chunk, "file_index": within}
+
+
+def card(info: Mapping[str, Any], tasks: Sequence[str], origin: Mapping[str, Any]) -> str:
+    """Return the card of a dataset: what a hub reads of it, and what a person wants to know first.
+
+    Args:
+        info: What info.json holds.
+        tasks: Task sentences.
+        origin: Where the last episodes come from; its ``license`` is the dataset's.
+    """
+    head = ["task_categories:", "- robotics", "tags:", "- LeRobot", "- softmode"]
+    head += [f"license: {origin['license']}"] if origin.get("license") else []
+    head += ["configs:", "- config_name: default", "  data_files: data/*/*.parquet"]
+    films = [name for name, kind in info["features"].items() if kind["dtype"] in ("video", "image")]
+    rows = {
+        "tasks": "; ".join(tasks),
+        "environment": origin.get("env", "not said"),
+        "robot": info["robot_type"] or "not said",
+        "episodes, frames": f"{info['total_episodes']}, {info['total_frames']}",
+        "frames per second": info["fps"],
+        "cameras": ", ".join(f"{name} {tuple(info['features'][name]['shape'])}" for name in films) or "none",
+    }
+    table = [f"| {name} | {value} |" for name, value in rows.items()]
+    text = f"Episodes of soft objects, simulated by softmode, in LeRobot's format {CODEBASE_VERSION}."
+    return "\n".join(["---", *head, "---", "", text, "", "| | |", "|---|---|", *table, ""])
 
 
 @dataclass(frozen=True, kw_only=True)

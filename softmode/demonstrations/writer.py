@@ -260,7 +260,10 @@ class DatasetWriter:
             (stage / "state.npz").write_bytes(state)
         else:  # one that a killed recording may have left behind
             (self._root / schema.STATE_PATH.format(number=number)).unlink(missing_ok=True)
-        moves[schema.INFO_PATH] = write_json(stage / "info.json", self._info(number + 1, start + count, tasks))
+        info = self._info(number + 1, start + count, tasks)
+        moves[schema.CARD_PATH] = stage / "README.md"
+        moves[schema.CARD_PATH].write_text(schema.card(info, list(tasks), origins[-1] if origins else {}), "utf-8")
+        moves[schema.INFO_PATH] = write_json(stage / "info.json", info)
         for source in moves.values():
             sync(source)
         for target, source in moves.items():

@@ -18,7 +18,7 @@ from softmode.checks import require_choice
 from softmode.envs.robots import Robot, with_robot
 from softmode.envs.task import Task
 from softmode.envs.task_config import ObservationType, TaskConfig
-from softmode.errors import ConfigError
+from softmode.errors import ConfigError, UnknownArgumentError
 from softmode.objects.config import ObjectConfig
 
 CONTROL_MODES = ("pose_delta", "joint_delta")
@@ -128,8 +128,8 @@ def _with_fields(config: TaskConfig, values: Mapping[str, Any]) -> TaskConfig:
     for name in sorted(set(values) - known):
         like = difflib.get_close_matches(name, sorted(known | {field.name for field in fields(Shortcuts)}), cutoff=0.4)
         near = f"Nearest: {', '.join(like)}. " if like else ""
-        raise ConfigError(
-            f"{name!r} is no option of the environment and no field of {type(config).__name__}",
+        raise UnknownArgumentError(
+            f"unexpected keyword argument {name!r}: no option of the environment, no field of {type(config).__name__}",
             hint=f"{near}Fields: {', '.join(sorted(known))}",
         )
     return replace(config, **values) if values else config

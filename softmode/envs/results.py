@@ -16,12 +16,14 @@ Tree = wp.array | np.ndarray | dict[str, "Tree"] | list["Tree"]
 
 
 def named_reasons(infos: dict[str, Any]) -> None:
-    """Add the names of the solver's flags of every world to infos in NumPy, with their mask."""
+    """Add the names of the solver's flags to infos in NumPy, with their mask: where any world has a flag."""
     status = infos["solver_status"]
+    if not np.any(status):
+        return
     names = np.empty(len(status), dtype=object)
     for world, bits in enumerate(status):
         names[world] = status_reasons(int(bits))
-    infos["solver_reasons"], infos["_solver_reasons"] = names, infos["_solver_status"].copy()
+    infos["solver_reasons"], infos["_solver_reasons"] = names, infos["_solver_status"] & (status != 0)
 
 
 def add_object_names(infos: dict[str, Any], names: Sequence[str]) -> None:

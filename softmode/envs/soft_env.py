@@ -59,10 +59,10 @@ class SoftEnv(TaskEnv[TaskT], gym.Env, gym.utils.EzPickle):
 
     The reward is the sum of ``info["reward_terms"]``. ``info`` also holds ``is_success``, the task's figures,
     how gently objects were handled (:class:`softmode.envs.handling.Handling`), ``is_safe_success``,
-    ``finger_force`` [N], ``parameters`` (what was drawn at reset), ``solver_status`` (the solver's flags),
-    ``solver_reasons`` (their names, such as "contact_overflow") and ``end_reason`` (:class:`EndReason`); with a set of
-    objects (``TaskConfig.objects``) ``object``, which one is there, and ``object_name``, with several per world that of
-    each slot, -1 for none, and a tuple of the names of those that are there. An episode
+    ``finger_force`` [N], ``parameters`` (what was drawn at reset), ``solver_status`` (the solver's flags), where there
+    are any ``solver_reasons`` (their names, such as "contact_overflow"), and ``end_reason`` (:class:`EndReason`); with
+    a set of objects (``TaskConfig.objects``) ``object``, which one is there, and ``object_name``, with several per
+    world that of each slot, -1 for none, and a tuple of the names of those that are there. An episode
     terminates only by failure, named by ``failure``, such as "dropped" or "diverged".
 
     ``reset`` takes as ``options`` any of the parameters, such as ``position`` (x, y) [m], ``yaw`` [rad],
@@ -258,7 +258,8 @@ class SoftEnv(TaskEnv[TaskT], gym.Env, gym.utils.EzPickle):
     def _info(self) -> dict[str, Any]:
         """Return the info of the present state."""
         info = take(self._result["info"], 0, scalars=True)
-        info["solver_reasons"] = status_reasons(info["solver_status"])
+        if info["solver_status"]:
+            info["solver_reasons"] = status_reasons(info["solver_status"])
         if self._object_names:
             info["object_name"] = name_of(info["object"], self._object_names)
         return info

@@ -302,7 +302,7 @@ class SoftVectorEnv(TaskEnv[TaskT], gym.vector.VectorEnv):
 
     def close_extras(self, **kwargs: Any) -> None:
         """Stop the child processes."""
-        for worlds in self._worlds:
+        for worlds in self.__dict__.get("_worlds", ()):  # gymnasium < 1.4 closes what its constructor refused
             worlds.close()
 
     @property

@@ -26,6 +26,7 @@ from softmode.learning.intervals import wilson_interval
 from softmode.learning.networks import Actor
 from softmode.learning.spaces import Interface
 from softmode.learning.vector_tensors import TensorVectorEnv, action_range, tensors_of
+from softmode.stages import stage
 
 EVALUATION_SEED = 1_000_000_000
 """First seed of evaluation episodes; training draws its seeds below."""
@@ -172,6 +173,7 @@ class Evaluation:
 
 
 @torch.no_grad()
+@stage("playing episodes")
 def evaluate(
     env: gym.Env | gym.vector.VectorEnv,
     policy: Callable[[Any], Any],

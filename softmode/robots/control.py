@@ -73,11 +73,6 @@ class ArmControlOptions:
             hint = "give two corners (x, y, z) in metres, lower before upper"
             raise ConfigError(f"workspace_lower {lower} is not below workspace_upper {upper}", hint=hint)
 
-    @property
-    def action_size(self) -> int:
-        """Entries of an action; the last one is the gripper, -1 squeezes and +1 opens."""
-        return 5 if self.mode == "pose_delta" else ARM_JOINT_COUNT + 1
-
 
 class Controller:
     """Holds the commanded configuration of one robot in every world and writes the joint targets.
@@ -122,7 +117,10 @@ class Controller:
         """Allocate the command of every world and set it to the model's initial coordinates."""
         self.options = options if options is not None else ArmControlOptions()
         self.arm, self.joint_count = arm, len(joints)
-        self.action_size = 5 if self.options.mode == "pose_delta" else self.joint_count + 1
+        steps = ("x", "y", "z", "yaw") if self.options.mode == "pose_delta" else map("joint.{}".format, joints)
+        self.action_names = (*steps, "gripper")
+        """Names of an action's entries; the last one is the gripper, -1 squeezes and +1 opens."""
+        self.action_size = len(self.action_names)
         self.world_count = w = max(model.world_count, 1)
         self._device = device = model.device
         self.coord_start = self._starts(model.joint_coord_world_start, arm.coord_start)
@@ -177,7 +175,7 @@ class Controller:
         """Move the commanded configuration by one action per world.
 
         Args:
-            action: Actions in [-1, 1], (world_count, options.action_size) float32; larger values are clamped and values
+            action: Actions in [-1, 1], (world_count, action_size) float32; larger values are clamped and values
                 that are not finite count as zero. The gripper entry names an opening which the command approaches at
                 opening_rate: +1 is fully open, -1 squeezes whatever is between the pads with the full drive force.
             state: The measured state, for the anti-windup.

@@ -132,10 +132,10 @@ def test_a_build_says_what_makes_a_body_too_stiff() -> None:
         body = build_body(plate, options, name="sheet", progress=False)
     texts = [str(one.message) for one in told]
     space = float(str(body.provenance["space_error"]))
-    assert any(text.startswith(f"body 'sheet': space_error {100.0 * space:.0f} %") for text in texts)
     assert any("at nu = 0.499; give function_count=80" in text for text in texts)
     found = [finding for finding in report_body(body).findings if finding.name == "space"]
-    assert f"{100.0 * space:.0f} % too high" in found[0].what
+    assert found[0].what.startswith(f"space_error {100.0 * space:.0f} %")
+    assert f"body 'sheet': {found[0].what}; {found[0].remedy}" in texts
 
 
 @pytest.mark.rest

@@ -22,7 +22,7 @@ from softmode.deformables.quadrature.quadrature_grid import Quadrature
 from softmode.deformables.reduction.build_body import build_body
 from softmode.deformables.reduction.cut import cut_body
 from softmode.deformables.reduction.kernel_detours import find_detours
-from softmode.deformables.reduction.kernel_visibility import Material, divide_at_gaps, find_visibility, material_of
+from softmode.deformables.reduction.kernel_visibility import Material, divide_at_gaps, hidden_points, material_of
 from softmode.deformables.reduction.options import BuildOptions
 from softmode.deformables.reduction.patch import Patch
 from softmode.deformables.reduction.sources import unpack_sources
@@ -72,11 +72,10 @@ def test_a_kernel_acts_within_its_support_on_what_is_connected_there() -> None:
     points = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 0.0], [1.0, 0.0, -1.0], [2.0, 0.0, 0.0], [2.0, 0.0, 1.0]])
     links = np.array([[0, 1], [1, 2], [2, 3], [3, 4]])
     material = Material(points=points, first=np.arange(5), links=links, part=np.zeros(5, dtype=np.intp), step=0.1)
-    found = find_visibility(material, points[:1], np.array([2.05]))
-    assert found is not None and found.hidden.tolist() == [4]
-    assert find_visibility(material, points[:1], np.array([2.3])) is None
+    assert np.concatenate(hidden_points(material, points[:1], np.array([2.05]))).tolist() == [4]
+    assert not hidden_points(material, points[:1], np.array([2.3]))
     two = dataclasses.replace(material, part=np.array([0, 0, 0, 0, 1]))
-    assert find_visibility(two, points[:1], np.array([2.05])) is None
+    assert not hidden_points(two, points[:1], np.array([2.05]))
 
 
 def test_ways_around_an_inner_corner() -> None:

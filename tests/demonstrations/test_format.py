@@ -31,6 +31,7 @@ def test_folder_holds_the_files_of_the_format_and_no_others(tmp_path: Path):
     """Table files of several episodes, one film per episode, nothing hidden."""
     write(tmp_path / "png", LENGTHS, "image")
     tables = [
+        "README.md",
         "data/chunk-000/file-000.parquet",
         "meta/episodes/chunk-000/file-000.parquet",
         "meta/info.json",
@@ -41,6 +42,9 @@ def test_folder_holds_the_files_of_the_format_and_no_others(tmp_path: Path):
     write(tmp_path / "video", LENGTHS, "video")
     films = [f"videos/{CAMERA}/chunk-000/file-{k:03d}.mp4" for k in range(len(LENGTHS))]
     assert listing(tmp_path / "video") == tables + films
+    card = (tmp_path / "video/README.md").read_text().splitlines()
+    assert card[0] == card[card.index("---", 1)] == "---" and "| robot | arm |" in card
+    assert any(line.startswith(f"| cameras | {CAMERA} (") for line in card)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["png", "video"]
 
 

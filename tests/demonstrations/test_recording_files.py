@@ -341,7 +341,7 @@ def test_interruption_at_every_step_of_saving(tmp_path: Path, monkeypatch: pytes
         assert_holds(read_dataset(folder), whole, film=pictures == "video")
         assert len(pq.read_table(folder / DATA)) == sum(LENGTHS)
         assert len(pq.read_table(folder / ROWS)) == len(LENGTHS)
-    assert cuts == 5 + (pictures == "video")  # film, data, tasks, episodes, stats, info
+    assert cuts == 6 + (pictures == "video")  # film, data, tasks, episodes, stats, card, info
 
 
 KILLED = """

@@ -228,7 +228,7 @@ def test_fields_are_keywords_and_success_alone_can_be_paid(soft_env: MakeEnv) ->
         assert reward == info["is_success"] == info["success"]
         paid.append((reward, sum(info["reward_terms"].values())))
     assert paid[0][0] == 0.0 and paid[-1][0] == 1.0 and all(dense > 0.0 for _, dense in paid[-10:])
-    with pytest.raises(ConfigError, match=r"'image_sise' is no option.*Nearest: image_size"):
+    with pytest.raises(ConfigError, match=r"unexpected keyword argument 'image_sise'.*Nearest: image_size"):
         gym.make("softmode/PressSoft-v0", image_sise=64)
     with pytest.raises(ConfigError, match="reward_mode is 'shaped'"):
         gym.make("softmode/PressSoft-v0", reward_mode="shaped")

@@ -229,7 +229,7 @@ def test_the_goal_is_another_body(square: ShapeSoftEnv) -> None:
     at_rest = info["shape_error"]
     info = play(env, 0, **given, goal=(0.05, 1.0))
     assert info["is_success"] and info["shape_error"] < at_rest + 0.05 < env.config.log_mass_tolerance
-    assert info["solver_reasons"] == ()
+    assert info.get("solver_reasons", ()) == ()
 
 
 # -- physics ----------------------------------------------------------------------------------------------------------
@@ -259,7 +259,7 @@ def test_the_foot_stays_where_it_is_clamped(shape: ShapeSoftEnv) -> None:
 def test_script_bends_the_post(shape: ShapeSoftEnv, seed: int) -> None:
     """The shape ends within 3 mm, without a complaint of the solver."""
     info = play(shape, seed)
-    assert info["is_success"] and info["shape_error"] < 0.003 and info["solver_reasons"] == ()
+    assert info["is_success"] and info["shape_error"] < 0.003 and info.get("solver_reasons", ()) == ()
 
 
 @pytest.mark.slow

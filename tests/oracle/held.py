@@ -37,7 +37,8 @@ STORED = Path(__file__).with_name("held.json")
 YOUNGS_MODULUS, DENSITY = 1.0e6, 1000.0
 FREQUENCIES = 6
 END = 0.1
-"""Width of the load that is spread over the end, over the extent: a Gaussian's standard deviation."""
+"""Width of the load that is spread over the end, over the extent: a Gaussian's standard deviation. That of the hollow
+box reaches all across, lid and walls: on the middle of the lid it would be one more load at the tip."""
 TETRAHEDRA = {"Y": 2500, "hollow box": 6000, "spoon": 6000, "hand": 5000, "fork": 6000}
 """Least number of tetrahedra."""
 RATIOS = {"plate, one edge": (0.3, 0.45, 0.49), "plate, two edges": (0.3, 0.45, 0.49)}
@@ -58,6 +59,8 @@ class Held:
     """Where the loads at the end are [m]."""
     width: float
     """Standard deviation of the load at the tip [m]."""
+    wide: bool = False
+    """Whether the load that is spread over the end reaches all across x and y."""
 
 
 def stored(name: str, poissons_ratio: float) -> dict[str, Any]:
@@ -78,13 +81,14 @@ def against_elements(body: ReducedBody, name: str, poissons_ratio: float) -> tup
     Second the frequencies over theirs, (6,). Both from the body's own points and gradients.
     """
     solid, reference = SOLIDS[name](), stored(name, poissons_ratio)
+    widths = (solid.width,) * 3, _end(solid, reference["extent"])
     quadrature, free = solid.quadrature(), 3 * body.driven_count
     X, value = quadrature.points, body.evaluate(quadrature.points - body.offset)[0]
     loose = np.min([region.distance(X)[0] for region in solid.regions], axis=0) > 0.0
     load = np.zeros((body.function_count, 3, 9))
     for a in range(3):
         load[:, a, a] = DENSITY * body.volume * body.mean_basis
-        for k, width in enumerate((solid.width, END * reference["extent"])):
+        for k, width in enumerate(widths):
             soft = _gaussian(X.T, solid.tip, width) * quadrature.weights * loose
             load[:, a, 3 + 3 * k + a] = value.T @ (soft / soft.sum())
     K = YOUNGS_MODULUS * stiffness(body, poissons_ratio).reshape((3, body.function_count) * 2)
@@ -96,8 +100,14 @@ def against_elements(body: ReducedBody, name: str, poissons_ratio: float) -> tup
     return works / reference["work"], np.sqrt(squares) / (2.0 * np.pi) / reference["frequency"]
 
 
-def _gaussian(x: Array, centre: tuple[float, float, float], width: float) -> Array:
-    return np.exp(-sum((x[i] - centre[i]) ** 2 for i in range(3)) / (2.0 * width**2))
+def _end(solid: Held, extent: float) -> tuple[float, float, float]:
+    """Return the standard deviations of the load over the end along each axis [m]."""
+    across = np.inf if solid.wide else END * extent
+    return across, across, END * extent
+
+
+def _gaussian(x: Array, centre: tuple[float, float, float], width: tuple[float, float, float]) -> Array:
+    return np.exp(-0.5 * sum(((x[i] - centre[i]) / width[i]) ** 2 for i in range(3)))
 
 
 def _grid(*lines: Array) -> Any:
@@ -382,6 +392,7 @@ def _tetrahedra(name: str) -> Held:
         elements=elements,
         tip=tip,
         width=width,
+        wide=name == "hollow box",
     )
 
 
@@ -427,7 +438,7 @@ def solve(name: str, poissons_ratio: float) -> dict[str, Any]:
     free = np.setdiff1d(np.arange(K.shape[0]), np.flatnonzero(fixed(basis.doflocs)))
     extent = float(np.ptp(mesh.p, axis=1).max())
     loads = [LinearForm(lambda v, w, a=a: DENSITY * v[a]).assemble(basis) for a in range(3)]
-    for width in (solid.width, END * extent):
+    for width in ((solid.width,) * 3, _end(solid, extent)):
         total = Functional(lambda w, s=width: _gaussian(w.x, solid.tip, s)).assemble(basis)
         for a in range(3):
             form = LinearForm(lambda v, w, a=a, s=width: _gaussian(w.x, solid.tip, s) * v[a])

@@ -24,8 +24,9 @@ def test_loads_and_frequencies(name: str, poissons_ratio: float) -> None:
         body = build_held(name, poissons_ratio)
     works, frequencies = against_elements(body, name, poissons_ratio)
     assert 0.95 < works[:3].min() and works[:3].max() < 1.05
-    if name != "hollow box":  # Its end is the middle of a thin lid.
-        assert (0.91 if name == "plate, two edges" else 0.95) < works[6:].min() and works[6:].max() < 1.05
+    # Loads on a thin lid, and in the plane in the middle between two edges, want more than 48 functions.
+    least = {"plate, two edges": 0.91, "hollow box": 0.9}.get(name, 0.95)
+    assert least < works[6:].min() and works[6:].max() < 1.05
     assert np.abs(frequencies[:5] - 1.0).max() < 0.05
     if name.startswith("plate"):
         assert abs(frequencies[5] - 1.0) < 0.06

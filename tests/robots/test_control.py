@@ -82,7 +82,7 @@ def test_workspace_and_limits_bound_the_command(rig, mode):
     low = np.array(rig.arm.description.joint_lower, dtype=np.float32)
     high = np.array(rig.arm.description.joint_upper, dtype=np.float32)
     for _ in range(60):
-        direction = rng.choice([-1.0, 1.0], options.action_size)
+        direction = rng.choice([-1.0, 1.0], controller.action_size)
         for _ in range(8):
             # The arm follows the command at once: this is about the command alone.
             controller.command(as_action(direction), rig.state)

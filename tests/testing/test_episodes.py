@@ -152,7 +152,7 @@ def test_policies_and_refusals(soft_env: Callable[..., gym.Env]) -> None:
     assert (policy.resets, policy.calls, len(played.steps)) == (1, 4, 4)
     assert played.base.config.render_size == 64  # pyright: ignore[reportAttributeAccessIssue]
     assert played.steps[-1].info["parameters"]["youngs_modulus"] == pytest.approx(5.0e4)
-    with pytest.raises(ConfigError, match=r"'forse_tolerance' is no option.*Nearest: force_tolerance"):
+    with pytest.raises(ConfigError, match=r"unexpected keyword argument 'forse_tolerance'.*Nearest: force_tolerance"):
         soft_env(PRESS, forse_tolerance=0.2)
     with pytest.raises(ConfigError, match="nothing ends the episode"):
         play_episode(env.unwrapped, "zero")

@@ -68,13 +68,14 @@ class Region:
             box = np.clip(np.asarray(self.box) - offset, bounds[0] - margin, bounds[1] + margin)
         return Region(name=self.name, box=box, points=points, radius=self.radius, stiffness=self.stiffness)
 
-    @property
-    def thickness(self) -> float:
-        """Its least extent, of points about along their principal axes [m]."""
-        span = np.asarray(self.box if self.points is None else self.points)
-        if self.points is not None:
-            span = span - span.mean(axis=0)
-            span = span @ np.linalg.svd(span, full_matrices=len(span) < 3)[2].T
+    def thickness(self, bounds: Array) -> float:
+        """Return its least extent within bounds (2, 3) [m], of points about along their principal axes [m]."""
+        if self.points is None:
+            grown = np.asarray(self.box) + self.radius * np.array([[-1.0], [1.0]])
+            return float(np.ptp(np.clip(grown, *bounds), axis=0).min())
+        span = np.asarray(self.points)
+        span = span - span.mean(axis=0)
+        span = span @ np.linalg.svd(span, full_matrices=len(span) < 3)[2].T
         return float(np.ptp(span, axis=0).min()) + 2.0 * self.radius
 
     @property

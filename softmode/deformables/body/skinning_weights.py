@@ -69,7 +69,7 @@ class SkinningWeights:
         """Return the weights (N, J) and, where kernels have gradients, theirs [1/m] (N, J, 3)."""
         value = shape.value @ self.coefficients
         axes = len(shape.gradient)
-        gradient = np.empty((*value.shape, axes))
+        gradient = np.empty((axes, *value.shape)).transpose(1, 2, 0)  # Axis by axis, as `products` reads it.
         for d, along in enumerate(shape.gradient):
             gradient[:, :, d] = along @ self.coefficients
         value[:, 0], gradient[:, 0] = 1.0, 0.0  # Exact, so that affine motion is; the kernels give it to rounding only.

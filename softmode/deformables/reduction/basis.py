@@ -19,17 +19,18 @@ from softmode.deformables.reduction.elastic_functions import (
     SPACE_ERROR,
     SPACE_MODE_COUNTS,
     TURN_COUNT,
+    ElasticChoice,
     Held,
     choose_functions,
 )
 from softmode.deformables.reduction.functions import (
     HELD_RANK_TOLERANCE,
-    TRACE_TOLERANCE,
     Functions,
+    RawFunctions,
     affine_first,
     driven_first,
-    orthonormal_in_mass,
     orthonormalise,
+    split_at_regions,
 )
 from softmode.deformables.reduction.galerkin import mass_matrix
 from softmode.deformables.reduction.kernel_visibility import Material, divide_at_gaps
@@ -63,6 +64,9 @@ plate gave way in its plane 4 % too far, between the points."""
 KERNEL_POINTS, MODE_POINTS = 3, 32
 """Free quadrature points for each kernel that acts among them, and for each quadratic eigenmode, where exact regions
 hold the rest: with fewer, displacements hide between points. Ten millimetres between two clamps were half as stiff."""
+THIN = 0.7
+"""A held body that has room for fewer kernels than this fraction of those asked for is thin, as plates and strips of
+50:1, and wants the large space: it is made at once, which takes a quarter less time."""
 LIP_COUNT = 20
 """Handles along the lips of slits, among the space that functions are chosen from. Eigenmodes resolve a slit slowly:
 48, 64, 96 and 128 of them each lower the first frequency of a slit plush, by 2 to 3 %."""
@@ -104,6 +108,11 @@ class Domain:
     """What distances of kernels run through; None: straight lines."""
     lips: Array
     """Points on both sides of slits [m], shape (N, 3)."""
+
+    def weighed(self, value: Array, gradient: Array) -> RawFunctions:
+        """Return raw functions (P, R) and their gradients [1/m] (P, R, 3) with what the points weigh."""
+        fraction = self.volumes / self.volumes.sum()
+        return RawFunctions(value, gradient, fraction * self.density, fraction * self.stiffness)
 
     def envelope(self, kernels: BasisRKPM) -> Envelope | None:
         """Return the envelope of the exact regions, if any: one kernel radius wide."""
@@ -161,6 +170,8 @@ def make_body_basis(
         return _basis(ground, domain, options, modes, stage)
     counts = (QUICK_SLIT_MODES, QUICK_SLIT_MODES) if quick and len(domain.lips) else SPACE_MODE_COUNTS
     small, large = (min(count, ground.most_modes) for count in counts)
+    if domain.regions and ground.kernels.kernel_count < THIN * options.kernels(len(domain.seeds)):
+        small = large
     alone = ground.envelope is not None and len(domain.regions) == 1 and large > small > ALONE_QUADRATIC
     modes = _modes(ground, domain, options, large if alone else small)
     basis = _basis(ground, domain, options, modes, stage, quadratic=ALONE_QUADRATIC if alone else None)
@@ -213,7 +224,7 @@ def _ground(domain: Domain, options: BuildOptions) -> _Ground:
     plain = kernels.evaluate(domain.points)
     shape, blend, blend_slope = enveloped(plain, envelope)
     springs, pull = _springs(kernels, envelope, domain)
-    mu, lame = lame_parameters(_mean_ratio(options))
+    mu, lame = lame_parameters(float(np.mean(options.poissons_ratios)))
     scalar = 1.0 / (lame + 4.0 * mu)
     return _Ground(
         kernels=kernels,
@@ -224,9 +235,7 @@ def _ground(domain: Domain, options: BuildOptions) -> _Ground:
         blend_slope=blend_slope,
         scalar=scalar,
         springs=springs,
-        region_weights=_region_weights(
-            domain, shape, blend_slope, *(None if x is None else scalar * x for x in (springs, pull))
-        ),
+        region_weights=_region_weights(domain, shape, *(None if x is None else scalar * x for x in (springs, pull))),
         most_modes=min([shape.centre_count - 1, *([] if free is None else [max(free // MODE_POINTS, 3 * TURN_COUNT)])]),
     )
 
@@ -286,29 +295,20 @@ def _quadratic_basis(domain: Domain, options: BuildOptions, stage: Callable[[str
     stage("kernels")
     stage("eigenmodes")
     stage("responses")
-    raw, raw_gradient = QuadraticFunctions(kernels=kernels, length=domain.length).evaluate(domain.points)
-    total, every = domain.volumes.sum(), np.arange(raw.shape[1])
-    fields = raw, raw_gradient, domain.volumes * domain.density / total, domain.volumes * domain.stiffness / total
+    raw = domain.weighed(*QuadraticFunctions(kernels=kernels, length=domain.length).evaluate(domain.points))
+    every = np.arange(raw.value.shape[1])
+    lead, none, others = np.eye(len(every))[:, [3, 0, 1, 2]], every[:0], every[4:]
+    report: dict[str, float] = {}
     if options.chosen:
-        choice = choose_functions(
-            *fields,
-            lead=np.eye(raw.shape[1])[:, [3, 0, 1, 2]],
-            kept=every[:0],
-            others=every[4:],
-            half=None,
-            quadratic=every[:10],
-            held=None,
-            count=options.function_count,
-            accuracy=options.accuracy,
-            poissons_ratios=options.poissons_ratios,
-        )
-        found, report = affine_first(choice.transform, every[:4], domain.length), choice.report()
+        quadratic = every[:10]
+        choice = choose_functions(raw, lead=lead, kept=none, others=others, options=options, quadratic=quadratic)
+        transform, report = choice.transform, choice.report()
     else:
-        tolerance = min(options.rank_tolerance, HELD_RANK_TOLERANCE)
-        found = orthonormalise(*fields, leading=every[:4], length=domain.length, rank_tolerance=tolerance)
-        report = {}
+        tolerance = _rank_tolerance(domain, options)
+        transform = orthonormalise(raw, lead=lead, kept=none, others=others, rank_tolerance=tolerance)
+    found = affine_first(transform, every[:4], domain.length)
     skin = constant_handle(len(kernels.centres))
-    basis = _finished(kernels, skin, np.zeros(1), found, raw_gradient, None, domain, report)
+    basis = _finished(kernels, skin, np.zeros(1), found, raw.gradient, None, domain, report)
     stage("functions")
     return basis
 
@@ -327,12 +327,12 @@ def _basis(
     Of a space the modes beyond `quadratic` carry affine motion alone.
     """
     kernels, shape, blend, blend_slope = ground.kernels, ground.shape, ground.blend, ground.blend_slope
-    envelope, points, springs = ground.envelope, domain.points, ground.springs
+    envelope, springs = ground.envelope, ground.springs
     stage("eigenmodes")
     skin = _weights(domain, options, modes, ground.region_weights, shape, blend_slope.shape[1], springs, quadratic)
     stage("responses")
-    raw, raw_gradient = skin.products(*skin.evaluate(shape, blend, blend_slope), points, domain.length)
-    total, samples = domain.volumes.sum(), domain.samples
+    raw = domain.weighed(*skin.products(*skin.evaluate(shape, blend, blend_slope), domain.points, domain.length))
+    samples = domain.samples
 
     def at_regions(rows: NDArray[np.bool_]) -> Array:
         """Return the raw functions at region samples, (rows, R)."""
@@ -340,62 +340,60 @@ def _basis(
         return skin.products(*skin.evaluate(*enveloped(kernels.evaluate(at), envelope)), at, domain.length)[0]
 
     trace = None if envelope is None else at_regions(samples.exact)
-    fields = raw, raw_gradient, domain.volumes * domain.density / total, domain.volumes * domain.stiffness / total
-    if not options.chosen:
-        found, report = (
-            orthonormalise(
-                *fields,
-                leading=skin.leading,
-                length=domain.length,
-                kept=skin.translating,
-                held=bool(domain.regions or options.local),
-                rank_tolerance=options.rank_tolerance,
-                trace=trace,
-            ),
-            {},
-        )
+    leading = np.concatenate([skin.leading[[3, 0, 1, 2]], skin.leading[4:]])  # 1 first: then only it has a mean.
+    count = raw.value.shape[1]
+    lead, driven = np.eye(count)[:, leading], np.zeros((count, 0))
+    if trace is not None:
+        lead, driven = split_at_regions(lead, raw, trace)
+    report: dict[str, float] = {}
+    if options.chosen:
+        springs_at = np.sqrt(_strength(domain) / domain.volumes.sum())[:, None] * at_regions(~samples.exact)
+        choice = _chosen(raw, skin, modes, domain, options, lead, driven, trace, springs_at, quadratic)
+        transform, report = choice.transform, choice.report()
     else:
-        springs_at = np.sqrt(_strength(domain) / total)[:, None] * at_regions(~samples.exact)
-        found, report = _chosen(fields, skin, modes, domain, options, trace, springs_at, quadratic)
-    basis = _finished(kernels, skin, modes.eigenvalues, found, raw_gradient, trace, domain, report)
+        kept, others = np.flatnonzero(skin.translating), np.setdiff1d(np.flatnonzero(~skin.translating), leading)
+        tolerance = _rank_tolerance(domain, options)
+        transform = orthonormalise(raw, lead=lead, kept=kept, others=others, rank_tolerance=tolerance)
+    if trace is None:
+        found = affine_first(transform, skin.leading, domain.length)
+    else:
+        found = driven_first(driven, transform, raw, skin.leading, domain.length)
+    basis = _finished(kernels, skin, modes.eigenvalues, found, raw.gradient, trace, domain, report)
     stage("functions")
     return basis
 
 
 def _chosen(
-    fields: tuple[Array, Array, Array, Array],
+    raw: RawFunctions,
     skin: SkinningWeights,
     modes: Eigenmodes,
     domain: Domain,
     options: BuildOptions,
+    lead: Array,
+    driven: Array,
     trace: Array | None,
     springs: Array,
     quadratic: int | None,
-) -> tuple[Functions, dict[str, float]]:
-    """Return functions chosen by elastic energy, those of exact regions first, and what the choice says of itself.
+) -> ElasticChoice:
+    """Return functions chosen by elastic energy, those that carry exact regions apart.
 
     Args:
-        fields: Raw functions (P, R), their gradients [1/m] (P, R, 3), fractions of mass (P,), of stiffness (P,).
+        raw: Raw functions.
         skin: Skinning weights.
         modes: Eigenmodes and local handles, which are among them after the constant handle and the regions.
         domain: What the body is.
         options: How many functions, and for which Poisson's ratios.
+        lead: Functions = raw @ lead of affine motion that come first, shape (R, f).
+        driven: Those that carry exact regions, shape (R, r).
         trace: Raw functions at points that fill the exact regions, (T, R); None without such regions.
         springs: Raw functions at points of soft regions, times the root of their springs per E and volume, (S, R).
         quadratic: Beyond so many the eigenmodes carry affine motion alone; None: they do not.
     """
-    raw, _, mass, _ = fields
-    leading = np.concatenate([skin.leading[[3, 0, 1, 2]], skin.leading[4:]])  # 1 first: then only it has a mean.
-    lead, driven = np.eye(raw.shape[1])[:, leading], np.zeros((raw.shape[1], 0))
     motions = np.zeros((0, 0))
     if trace is not None:
-        lead = orthonormal_in_mass(lead, raw, mass)
-        size, across = np.linalg.svd(np.linalg.qr(trace @ lead, mode="r"))[1:]
-        count = int((size > TRACE_TOLERANCE * size[0]).sum())
-        lead, driven = lead @ across[count:].T, lead @ across[:count].T
         motions = rigid_motions(domain.samples, trace @ driven, len(domain.regions))
     soft = (skin.owner > 0) & (skin.owner < len(domain.regions))
-    others = np.setdiff1d(np.flatnonzero(~soft), leading)
+    others = np.setdiff1d(np.flatnonzero(~soft), skin.leading)
     first_mode, mode_count = max(1, len(domain.regions)), len(modes.eigenvalues) - 1 - modes.local_count
     turned, level = np.zeros(0, dtype=np.intp), np.zeros(0)
     if motions.shape[1] and not options.local:
@@ -404,23 +402,18 @@ def _chosen(
         )
         level = np.sqrt(modes.eigenvalues[1] / modes.eigenvalues[1 + skin.owner[turned] - first_mode])
     late = (skin.owner >= first_mode + (quadratic or mode_count // 2)) & (skin.owner < first_mode + mode_count)
-    chosen = choose_functions(
-        *fields,
+    return choose_functions(
+        raw,
         lead=lead,
-        kept=np.setdiff1d(np.flatnonzero(soft), leading),
+        kept=np.setdiff1d(np.flatnonzero(soft), skin.leading),
         others=others,
+        options=options,
         half=None if options.local else others[~late[others]],
         quadratic=np.arange(10) if trace is None else None,
         held=Held(driven=driven, motions=motions, springs=springs, turned=turned, level=level)
         if domain.regions
         else None,
-        count=options.function_count,
-        accuracy=options.accuracy,
-        poissons_ratios=options.poissons_ratios,
     )
-    if trace is None:
-        return affine_first(chosen.transform, skin.leading, domain.length), chosen.report()
-    return driven_first(driven, chosen.transform, raw, mass, skin.leading, domain.length), chosen.report()
 
 
 def _finished(
@@ -461,25 +454,21 @@ def _finished(
     )
 
 
-def _mean_ratio(options: BuildOptions) -> float:
-    """Return the Poisson's ratio of the static responses."""
-    return sum(options.poissons_ratios) / len(options.poissons_ratios)
+def _rank_tolerance(domain: Domain, options: BuildOptions) -> float:
+    """Return which directions of FreeForm's functions are dropped: fewer on a body with regions, or local handles."""
+    return min(options.rank_tolerance, HELD_RANK_TOLERANCE if domain.regions or options.local else np.inf)
 
 
 def _springs(kernels: BasisRKPM, envelope: Envelope | None, domain: Domain) -> tuple[Array | None, Array | None]:
-    """Return what soft regions add, per E: springs [m] (K, K), and their pull on the weights of regions [m] (K, R).
-
-    Columns of the pull: exact regions first, then soft ones, as `solve_harmonic_weights` wants them.
-    """
+    """Return what soft regions add, per E: springs [m] (K, K), and the pull of each on its weight [m] (K, S)."""
     samples = domain.samples
     soft = np.flatnonzero(~samples.exact)
     if not len(soft):
         return None, None
     strength = _strength(domain)
-    shape, blend, _ = enveloped(kernels.evaluate(samples.points[soft]), envelope)
+    shape = enveloped(kernels.evaluate(samples.points[soft]), envelope)[0]
     own = samples.index[soft][:, None] == np.unique(samples.index[soft])
-    pull = shape.value.T @ (strength[:, None] * np.concatenate([-blend, own.astype(np.float64)], axis=1))
-    return mass_matrix(shape, strength), np.asarray(pull)
+    return mass_matrix(shape, strength), np.asarray(shape.value.T @ (strength[:, None] * own))
 
 
 def _strength(domain: Domain) -> Array:
@@ -489,29 +478,20 @@ def _strength(domain: Domain) -> Array:
     return stiffness * samples.weights[~samples.exact]
 
 
-def _region_weights(
-    domain: Domain, shape: ShapeFunctions, blend_slope: Array, springs: Array | None, pull: Array | None
-) -> Array:
-    """Return coefficients of the weights of all regions but the last, exact ones first, (K, R - 1).
+def _region_weights(domain: Domain, shape: ShapeFunctions, springs: Array | None, pull: Array | None) -> Array:
+    """Return coefficients of the weights of all regions but one, exact ones first, (K, R - 1).
 
-    The weights of all regions sum to one: beside the constant handle the last one adds nothing. Where all are exact
-    they are the blends as they are: eigenmodes cannot cancel what kernels would add, and edges of a plate 40:1 were 1.4
-    times too stiff when one moved out of its plane.
+    The weights of exact regions sum to one, and so do those of soft ones where there are no others: beside the constant
+    handle the last adds nothing. Those of exact regions are their blends as they are: eigenmodes cannot cancel what
+    kernels would add, and edges of a plate 40:1 were 1.4 times too stiff when one moved out of its plane.
     """
-    count = len(domain.regions) - 1
-    if count < 1 or springs is None or pull is None:
-        return np.zeros((shape.centre_count, max(count, 0)))
-    gradient = np.zeros((len(domain.points), count, 3))
-    exact = min(blend_slope.shape[1], count)
-    gradient[:, :exact] = blend_slope[:, :exact]
-    return solve_harmonic_weights(
-        shape,
-        domain.volumes,
-        blend_gradient=gradient,
-        stiffness_scale=domain.stiffness,
-        springs=springs,
-        spring_load=pull[:, :count],
-    )
+    exact = sum(region.stiffness is None for region in domain.regions)
+    blends = np.zeros((shape.centre_count, max(exact - 1, 0)))
+    if springs is None or pull is None:
+        return blends
+    given = {"stiffness_scale": domain.stiffness, "springs": springs, "spring_load": pull}
+    soft = solve_harmonic_weights(shape, domain.volumes, **given)
+    return np.concatenate([blends, soft[:, 0 if exact else 1 :]], axis=1)
 
 
 def _weights(
@@ -540,7 +520,7 @@ def _weights(
             shape,
             domain.volumes,
             density=domain.density,
-            poissons_ratio=_mean_ratio(options),
+            poissons_ratio=float(np.mean(options.poissons_ratios)),
             stiffness_scale=domain.stiffness,
             springs=springs,
             derivative_count=0 if options.chosen else options.response_derivatives,
@@ -549,8 +529,7 @@ def _weights(
         parts.append(responses)
         degrees += [0] * responses.shape[1]
     blends = np.full(len(degrees), -1, dtype=np.int64)
-    exact = min(exact_count, region_count)
-    blends[1 : 1 + exact] = np.arange(exact)
+    blends[1:exact_count] = np.arange(exact_count - 1)
     return SkinningWeights(
         coefficients=np.concatenate(parts, axis=1), degrees=np.array(degrees, dtype=np.int64), blends=blends
     )

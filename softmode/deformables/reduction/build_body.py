@@ -21,7 +21,7 @@ from softmode.deformables.quadrature.quadrature_grid import Quadrature
 from softmode.deformables.reduction.basis import BodyBasis, Domain, make_body_basis
 from softmode.deformables.reduction.cache import cache_directory, cached_body, fingerprint_of
 from softmode.deformables.reduction.cubature import Cubature, select_cubature
-from softmode.deformables.reduction.elastic_functions import SPACE_WARNING
+from softmode.deformables.reduction.elastic_functions import EXCESS, EXCESS_WARNING
 from softmode.deformables.reduction.kernel_visibility import lips_of, material_of
 from softmode.deformables.reduction.options import FUNCTION_COUNT, BuildOptions, HandleName
 from softmode.deformables.reduction.region_samples import longest_edge, pieces_near, refine_at_faces, sample_regions
@@ -155,7 +155,7 @@ def _build(
     seeds, bounds = places - offset, quadrature.bounds - offset
     length = float(np.sqrt(mass @ (seeds**2).sum(axis=1)))
     regions = tuple(region.moved(offset, bounds) for region in regions)
-    samples = sample_regions(regions, pieces, offset, stiffness, quadrature.spacing)
+    samples = sample_regions(regions, pieces, offset, stiffness, quadrature.spacing, bounds)
     points, volumes, parent = refine_at_faces(regions, pieces, offset)
     stiffness = stiffness[parent]
     seconds: dict[str, float] = {}
@@ -263,22 +263,12 @@ def _warn_of_stiffness(name: str, basis: BodyBasis, options: BuildOptions) -> No
         RuntimeWarning: If its kernels do not resolve it, or motions of its regions, or its Poisson's ratio wants more
             functions.
     """
-    space, ratio = basis.report.get("space_error", 0.0), max(options.poissons_ratios)
-    if space > SPACE_WARNING:
-        warnings.warn(
-            f"body {name!r}: space_error {100.0 * space:.0f} %: its first six frequencies may be that much too high, by"
-            " corners, branches or thin walls that its kernels do not resolve; build it with twice the points",
-            RuntimeWarning,
-            stacklevel=4,
-        )
-    driven = basis.report.get("driven_error", 0.0)
-    if driven > SPACE_WARNING:
-        warnings.warn(
-            f"body {name!r}: driven_error {100.0 * driven:.0f} %: its regions may resist each other's motion that much"
-            " too stiffly; build it with twice the points, or with more functions",
-            RuntimeWarning,
-            stacklevel=4,
-        )
+    for key in ("space_error", "driven_error"):
+        if (error := basis.report.get(key, 0.0)) > EXCESS_WARNING:
+            what, remedy = EXCESS[key][2:]
+            text = f"body {name!r}: {key} {100.0 * error:.0f} %: {what}; {remedy}"
+            warnings.warn(text, RuntimeWarning, stacklevel=4)
+    ratio = max(options.poissons_ratios)
     if options.chosen and ratio > NU_LIMIT and (options.function_count or FUNCTION_COUNT) <= FUNCTION_COUNT:
         warnings.warn(
             f"body {name!r}: {FUNCTION_COUNT} functions are up to 4 % too stiff at nu = {ratio:g};"

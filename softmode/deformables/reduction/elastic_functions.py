@@ -31,13 +31,14 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from softmode.deformables.reduction.functions import KEPT_TOLERANCE, orthonormal_in_mass
-from softmode.deformables.reduction.options import FUNCTION_COUNT, FUNCTION_LEAST, FUNCTION_LIMIT
+from softmode.deformables.reduction.functions import KEPT_TOLERANCE, RawFunctions, independent, orthonormal_in_mass
+from softmode.deformables.reduction.options import FUNCTION_COUNT, FUNCTION_LEAST, FUNCTION_LIMIT, BuildOptions
 from softmode.deformables.reduction.reduced_stiffness import elastic_stiffness
 from softmode.deformables.reduction.static_response import lame_parameters, second_order_load
 from softmode.errors import BasisError, ConfigError
@@ -49,8 +50,31 @@ SPACE_MODE_COUNTS = 48, 96
 too stiff with 48 and 1.5 % with 96, for three times the time."""
 SPACE_ERROR = 0.02
 """The space is made larger where its second half lowers one of the first six frequencies by more than this."""
-SPACE_WARNING = 0.05
-"""A build says so where the space is not settled by more than this; so does the report of a body."""
+EXCESS = {
+    "frequency_error": (
+        "error of the first frequencies",
+        "functions",
+        "its first six frequencies are that much too high with its functions",
+        "build it with --accuracy 0.03, or more --functions",
+    ),
+    "space_error": (
+        "second half of the space",
+        "space",
+        "its first six frequencies may be that much too high, by corners, branches or thin walls that its kernels do"
+        " not resolve, whatever the number of functions",
+        "build it with twice the points (--points): more points allow narrower kernels",
+    ),
+    "driven_error": (
+        "excess of stiffness between regions",
+        "regions",
+        "its regions may resist each other's motion that much too stiffly",
+        "build it with twice the points (--points), or more functions (--functions)",
+    ),
+}
+"""What a build says of its own stiffness: names of a measure and a finding, what it means, and the remedy, by key."""
+EXCESS_WARNING = 0.05
+"""The report of a body says so where one of these is larger; so does a build, but for what the functions lack, whose
+number is asked for."""
 TARGET_COUNT = 40
 """Elastic modes among the targets; it does not depend on the number of functions, or these would not be nested."""
 JUDGED_COUNT = 6
@@ -142,37 +166,27 @@ class ElasticChoice:
 
 
 def choose_functions(
-    raw: Array,
-    raw_gradient: Array,
-    mass: Array,
-    stiff: Array,
+    raw: RawFunctions,
     *,
     lead: Array,
     kept: NDArray[np.intp],
     others: NDArray[np.intp],
-    half: NDArray[np.intp] | None,
-    quadratic: NDArray[np.intp] | None,
-    held: Held | None,
-    count: int | None,
-    accuracy: float | None,
-    poissons_ratios: tuple[float, ...],
+    options: BuildOptions,
+    half: NDArray[np.intp] | None = None,
+    quadratic: NDArray[np.intp] | None = None,
+    held: Held | None = None,
 ) -> ElasticChoice:
     """Choose functions by elastic energy.
 
     Args:
-        raw: Raw functions at the quadrature points, (P, R).
-        raw_gradient: Their gradients [1/m], (P, R, 3).
-        mass: Fractions of mass, shape (P,).
-        stiff: Fractions of volume times relative Young's modulus, shape (P,).
+        raw: Raw functions.
         lead: Functions = raw @ lead that come first, shape (R, f): 1, x, y, z of a body without exact regions.
         kept: Raw functions that come next: affine motions of soft regions.
         others: Raw functions that the rest is chosen from. On a body with exact regions all of these vanish there.
+        options: How many functions, all that come first among them, or how accurate; and for which Poisson's ratios.
         half: The others without those that the second half of the eigenmodes makes; None without eigenmodes.
         quadratic: The ten raw functions x, y, z, 1, xx, ..., zx; None on a body with exact regions.
         held: What regions ask for; None for a body without regions.
-        count: Number of functions, all that come first among them; None for 48, or for as many as `accuracy` takes.
-        accuracy: Largest relative error of the first six frequencies, or None.
-        poissons_ratios: The body's own, or several.
 
     Warns:
         RuntimeWarning: If there are fewer functions than asked for, which begins at about 130.
@@ -181,8 +195,9 @@ def choose_functions(
         ConfigError: If the accuracy is not reached within 120 functions, or the regions alone need more than `count`.
         BasisError: If the elastic stiffness is singular.
     """
-    space = _ElasticSpace(raw, raw_gradient, mass, stiff, lead, kept, others, held)
-    fields = None if quadratic is None else space.transform.T @ (raw.T @ (mass[:, None] * raw[:, quadratic]))
+    count, accuracy = options.function_count, options.accuracy
+    space = _ElasticSpace(raw, lead, kept, others, held)
+    fields = None if quadratic is None else space.transform.T @ raw.products(quadratic)
     driven = 0 if held is None else held.driven.shape[1]
     most = FUNCTION_LIMIT if accuracy is not None else count or FUNCTION_COUNT
     least = driven + space.fixed
@@ -191,10 +206,11 @@ def choose_functions(
             f"function_count: {most} asked for, affine motions of the body and its regions are {least}",
             hint=f"give {least + FUNCTION_LEAST} or more",
         )
-    order, shares, modes = space.order(fields, poissons_ratios, min(most - driven, space.count))
+    order, shares, modes = space.order(fields, options.poissons_ratios, min(most - driven, space.count))
     chosen = order.shape[1]
-    error = space.frequency_error(order, modes)
-    smaller = None if half is None else space.spanned(raw.T @ (mass[:, None] * raw[:, half]))
+    few = space.restricted(order)
+    error = space.frequency_error(few, modes)
+    smaller = None if half is None else space.restricted(space.spanned(raw.products(half)))
     if accuracy is not None:
         if error > accuracy:
             raise ConfigError(
@@ -204,10 +220,11 @@ def choose_functions(
         low = space.fixed  # The error falls with the number of functions, because they are nested.
         while chosen - low > 1:
             middle = (low + chosen) // 2
-            reached = space.frequency_error(order[:, :middle], modes)
+            reached = space.frequency_error(space.restricted(order[:, :middle]), modes)
             low, chosen = (low, middle) if reached <= accuracy else (middle, chosen)
         chosen = min(_complete(shares, chosen), order.shape[1])
-        error = space.frequency_error(order[:, :chosen], modes)
+        few = space.restricted(order[:, :chosen])
+        error = space.frequency_error(few, modes)
     if count is not None and chosen + driven < count:
         warnings.warn(
             f"function_count: {count} asked for, the object's elastic modes make {chosen + driven}",
@@ -215,10 +232,10 @@ def choose_functions(
             stacklevel=2,
         )
     return ElasticChoice(
-        transform=orthonormal_in_mass(space.transform @ order[:, :chosen], raw, mass),
+        transform=orthonormal_in_mass(space.transform @ order[:, :chosen], raw),
         frequency_error=error,
         space_error=None if smaller is None else space.frequency_error(smaller, modes),
-        driven_error=space.driven_error([order[:, :chosen], *([] if smaller is None else [smaller])]),
+        driven_error=space.driven_error([few, *([] if smaller is None else [smaller])]),
         space_count=space.count + driven,
         complete_count=_complete(shares, chosen) + driven,
         space_eigenvalues=modes,
@@ -232,58 +249,38 @@ def _complete(shares: Array, count: int) -> int:
     return count
 
 
+class _Part(NamedTuple):
+    """A part of a space, with what its functions cost."""
+
+    chosen: Array
+    """Its functions in the space, shape (V, n)."""
+    products: Array
+    """Of their gradients, shape (3, n, 3, n)."""
+    springs: Array
+    """What soft regions add for each component, per E, shape (n, n)."""
+
+    def stiffness(self, poissons_ratio: float) -> Array:
+        """Return their stiffness with the springs, (3 n, 3 n)."""
+        return elastic_stiffness(self.products, poissons_ratio) + np.kron(np.eye(3), self.springs)
+
+
 class _ElasticSpace:
     """A space of scalar functions, orthonormal in mass, with the products of their gradients."""
 
     def __init__(
         self,
-        raw: Array,
-        raw_gradient: Array,
-        mass: Array,
-        stiff: Array,
+        raw: RawFunctions,
         lead: Array,
         kept: NDArray[np.intp],
         others: NDArray[np.intp],
         held: Held | None,
     ) -> None:
-        weighted = raw * np.sqrt(mass)[:, None]
-        scale = 1.0 / np.maximum(np.linalg.norm(weighted, axis=0), 1e-300)
-        weighted *= scale
-        lead = lead / scale[:, None]
-        lead /= np.abs(lead).max(axis=0)
-        value, upper = np.linalg.qr(weighted @ lead)
-        sign = np.sign(np.diag(upper))
-        value *= sign
-        transform = lead @ np.linalg.inv(upper * sign[:, None])
-        counts = [lead.shape[1]]
-        for index, tolerance in (
-            (kept, KEPT_TOLERANCE),
-            (others, SPACE_TOLERANCE if held is None else HELD_SPACE_TOLERANCE),
-        ):
-            if not len(index):
-                counts.append(counts[-1])
-                continue
-            rest, content = weighted[:, index], np.zeros((value.shape[1], len(index)))
-            for _ in range(2):
-                found = value.T @ rest
-                rest -= value @ found
-                content += found
-            size, vector = linalg.eigh(rest.T @ rest, check_finite=False)
-            keep = size > tolerance * size[-1]
-            turn = vector[:, keep] / np.sqrt(size[keep])
-            part = np.zeros((raw.shape[1], turn.shape[1]))
-            part[index] = turn
-            transform = np.concatenate([transform, part - transform @ (content @ turn)], axis=1)
-            counts.append(transform.shape[1])
-            if index is kept:  # What comes after must be apart from these.
-                value = np.concatenate([value, rest @ turn], axis=1)
-        self.fixed, self.count = counts[1:]
-        """How many functions come first in any case, and how many there are."""
-        self.transform = transform * scale[:, None]
-        """Functions = raw @ transform, shape (R, V)."""
+        tolerance = SPACE_TOLERANCE if held is None else HELD_SPACE_TOLERANCE
+        self.transform, (self.fixed, self.count) = independent(raw, lead, [(kept, KEPT_TOLERANCE), (others, tolerance)])
+        """Functions = raw @ transform, shape (R, V); how many come first in any case, and how many there are."""
         every = self.transform if held is None else np.concatenate([self.transform, held.driven], axis=1)
-        root = np.sqrt(stiff)[:, None]
-        slopes = [raw_gradient[:, :, d] * root for d in range(3)]
+        root = np.sqrt(raw.stiff)[:, None]
+        slopes = [raw.gradient[:, :, d] * root for d in range(3)]
         self.products = np.empty((3, every.shape[1], 3, every.shape[1]))
         """sum_p s_p d_i b_k d_j b_l, driven functions last, shape (3, V + r, 3, V + r)."""
         for d in range(3):
@@ -297,6 +294,8 @@ class _ElasticSpace:
         """What soft regions add to the stiffness of each component, per E, shape (V, V)."""
         self.held, self.exact = held, held is not None and held.driven.shape[1] > 0
         self.rigid = RIGID if held is None else 0
+        self.factored: tuple[float, Array, Any] | None = None
+        """Poisson's ratio, stiffness of the free functions of a held body, its factor."""
         self.answered: tuple[float, Array, Array, Array] | None = None
         """Poisson's ratio, energy of driven functions, their pull on others, motions of regions of unit energy."""
         self.alone = held is not None and self.exact and not held.motions.shape[1]
@@ -305,9 +304,9 @@ class _ElasticSpace:
             pull = held.springs @ self.transform
             self.springs = pull.T @ pull
             self.energy = self.energy + self.springs
-            self.mean = self.transform.T @ (raw.T @ mass)
-            self.slopes, self.stiff = [raw_gradient[:, :, d] for d in range(3)], stiff
-            turned = self.transform.T @ (raw.T @ (mass[:, None] * raw[:, held.turned]))
+            self.mean = self.transform.T @ (raw.value.T @ raw.mass)
+            self.slopes, self.stiff = [raw.gradient[:, :, d] for d in range(3)], raw.stiff
+            turned = self.transform.T @ raw.products(held.turned)
             turned *= TURN_LEVEL * held.level / np.sqrt(np.einsum("ak,ab,bk->k", turned, self.energy, turned))
             self.turned = np.concatenate([turned, np.zeros((2 * self.count, turned.shape[1]))])
 
@@ -355,24 +354,29 @@ class _ElasticSpace:
         vector, size, _ = np.linalg.svd(inside, full_matrices=False)
         return np.concatenate([np.eye(self.count, self.fixed), vector[:, size > 1e-5 * size[0]]], axis=1)
 
-    def frequency_error(self, chosen: Array, modes: dict[float, Array]) -> float:
-        """Return the largest relative error of the first frequencies of chosen functions (V, n)."""
-        part = np.einsum("ak,iajb,bl->ikjl", chosen, self.free, chosen, optimize=True)
-        springs, worst = chosen.T @ self.springs @ chosen, 0.0
+    def restricted(self, chosen: Array) -> _Part:
+        """Return the part of the space that some functions (V, n) span."""
+        products = np.empty((3, chosen.shape[1], 3, chosen.shape[1]))
+        for d in range(3):
+            for e in range(d + 1):
+                block = chosen.T @ self.free[d, :, e] @ chosen
+                products[d, :, e], products[e, :, d] = block, block.T
+        return _Part(chosen, products, chosen.T @ self.springs @ chosen)
+
+    def frequency_error(self, few: _Part, modes: dict[float, Array]) -> float:
+        """Return the largest relative error of the first frequencies of a part of the space."""
+        worst = 0.0
         for ratio, value in modes.items():
-            last = min(self.rigid + len(value), 3 * chosen.shape[1]) - 1
-            found = linalg.eigh(
-                elastic_stiffness(part, ratio) + np.kron(np.eye(3), springs),
-                eigvals_only=True,
-                subset_by_index=[self.rigid, last],
-                check_finite=False,
-            )
+            stiffness = few.stiffness(ratio)
+            last = min(self.rigid + len(value), len(stiffness)) - 1
+            which = [self.rigid, last]
+            found = linalg.eigh(stiffness, eigvals_only=True, subset_by_index=which, check_finite=False)
             real = value[: len(found)] > 1e-9 * value[-1]
             worst = max(worst, float((np.sqrt(found[real] / value[: len(found)][real]) - 1.0).max()))
         return worst
 
-    def driven_error(self, spaces: list[Array]) -> float | None:
-        """Return by how much exact regions are stiffer against each other in the worst of some spaces (V, n), or None.
+    def driven_error(self, parts: list[_Part]) -> float | None:
+        """Return by how much exact regions are stiffer against each other in the worst of some parts, or None.
 
         Of all their motions it is the worst one: the largest ratio of energies, less one.
         """
@@ -380,22 +384,37 @@ class _ElasticSpace:
             return None
         ratio, base, pull, motion = self.answered
         worst = 1.0
-        for chosen in spaces:
-            part = np.einsum("ak,iajb,bl->ikjl", chosen, self.free, chosen, optimize=True)
-            stiffness = elastic_stiffness(part, ratio) + np.kron(np.eye(3), chosen.T @ self.springs @ chosen)
-            load = np.einsum("ak,iam->ikm", chosen, pull.reshape(3, self.count, -1)).reshape(len(stiffness), -1)
+        for few in parts:
+            stiffness = few.stiffness(ratio)
+            load = np.einsum("ak,iam->ikm", few.chosen, pull.reshape(3, self.count, -1)).reshape(len(stiffness), -1)
             energy = base - load.T @ linalg.solve(stiffness, load, assume_a="pos", check_finite=False)
             worst = max(worst, float(np.linalg.eigvalsh(motion.T @ energy @ motion)[-1]))
         return worst - 1.0
 
-    def _stiffness(self, poissons_ratio: float) -> Array:
-        """Return the stiffness of the free functions with the springs of soft regions, (3 V, 3 V)."""
-        return elastic_stiffness(self.free, poissons_ratio) + np.kron(np.eye(3), self.springs)
+    def _solved(self, poissons_ratio: float) -> tuple[Array, Any]:
+        """Return the stiffness of the free functions of a held body (3 V, 3 V), and its factor; the last one is kept.
+
+        Raises:
+            BasisError: If nothing holds the body.
+        """
+        if self.factored is None or self.factored[0] != poissons_ratio:
+            stiffness = elastic_stiffness(self.free, poissons_ratio) + np.kron(np.eye(3), self.springs)
+            try:
+                factor = linalg.cho_factor(stiffness.T, lower=True, check_finite=False)
+            except linalg.LinAlgError as error:
+                raise BasisError("the static response has no solution", hint="Hold the body by a region.") from error
+            self.factored = poissons_ratio, stiffness, factor
+        return self.factored[1:]
 
     def _targets(self, fields: Array | None, poissons_ratio: float, floor: float) -> tuple[Array, Array]:
         """Return the lowest elastic modes, then Ritz modes of fields, (3 V, T), and their eigenvalues (T,)."""
-        stiffness = self._stiffness(poissons_ratio)
-        value, mode = _lowest(stiffness, 1e3 * floor, min(TARGET_COUNT + RIGID, 3 * self.count - 1))
+        count = min(TARGET_COUNT + RIGID, 3 * self.count - 1)
+        if self.held is None:
+            stiffness = elastic_stiffness(self.free, poissons_ratio)
+            value, mode = _lowest(stiffness, count, 1e3 * floor)
+        else:
+            stiffness, factor = self._solved(poissons_ratio)
+            value, mode = _lowest(stiffness, count, factor=factor)
         value, mode = value[self.rigid :], mode[:, self.rigid :]
         if fields is None:
             return mode, value
@@ -406,10 +425,7 @@ class _ElasticSpace:
 
     def _responses(self, held: Held, poissons_ratio: float) -> tuple[Array, Array]:
         """Return static responses to unit body forces (3 V, 3); those of second order, slow loads and moved regions."""
-        try:
-            factor = linalg.cho_factor(self._stiffness(poissons_ratio), check_finite=False)
-        except linalg.LinAlgError as error:
-            raise BasisError("the static response has no solution", hint="Hold the body by a region.") from error
+        factor = self._solved(poissons_ratio)[1]
         force = np.kron(np.eye(3), self.mean[:, None])
         first = linalg.cho_solve(factor, force)
         first /= np.sqrt(np.einsum("ak,ak->k", first, force))
@@ -432,11 +448,10 @@ class _ElasticSpace:
                 more.append(answer * (LOAD_LEVEL / np.sqrt(np.linalg.eigvalsh(along.T @ answer)[-1])))
         if held.motions.shape[1]:
             # Constraint modes: the body's answer to rigid motions of its exact regions, as Ritz modes.
-            whole, free = elastic_stiffness(self.products, poissons_ratio), np.zeros(3 * self.products.shape[1], bool)
-            free.reshape(3, -1)[:, : self.count] = True
-            pull = whole[np.ix_(free, ~free)] @ held.motions
-            answer = -linalg.cho_solve(factor, pull)
-            base = held.motions.T @ whole[np.ix_(~free, ~free)] @ held.motions
+            whole = elastic_stiffness(self.products[:, :, :, self.count :], poissons_ratio)
+            whole = whole.reshape(3, -1, len(held.motions)) @ held.motions
+            pull, own = (part.reshape(-1, part.shape[2]) for part in (whole[:, : self.count], whole[:, self.count :]))
+            answer, base = -linalg.cho_solve(factor, pull), held.motions.T @ own
             value, vector = linalg.eigh(base + pull.T @ answer, held.motions.T @ held.motions + answer.T @ answer)
             motion = vector[:, RIGID:] / np.sqrt(value[RIGID:])
             self.answered = poissons_ratio, base, pull, motion
@@ -469,7 +484,7 @@ class _ElasticSpace:
         return np.concatenate([found, more * np.sign(np.diag(upper))], axis=1), share
 
 
-def _lowest(stiffness: Array, shift: float, count: int) -> tuple[Array, Array]:
+def _lowest(stiffness: Array, count: int, shift: float = 0.0, factor: Any = None) -> tuple[Array, Array]:
     """Return the lowest eigenpairs of a stiffness (N, N), ascending: block Lanczos on the shifted inverse.
 
     A block is wider than any cluster of equal frequencies, of which single vectors find one at a time, and is solved
@@ -479,12 +494,15 @@ def _lowest(stiffness: Array, shift: float, count: int) -> tuple[Array, Array]:
     if size <= 2 * BLOCK * steps:
         value, vector = linalg.eigh(stiffness, subset_by_index=[0, count - 1], check_finite=False)
     else:
-        shifted = stiffness.copy()
-        shifted[np.diag_indices(size)] += shift
-        try:
-            factor = linalg.cho_factor(shifted, check_finite=False, overwrite_a=True)
-        except linalg.LinAlgError as error:
-            raise BasisError("the elastic stiffness is singular", hint="Use fewer kernels or more points.") from error
+        if factor is None:
+            shifted = stiffness.copy()
+            shifted[np.diag_indices(size)] += shift
+            try:
+                factor = linalg.cho_factor(shifted, check_finite=False, overwrite_a=True)
+            except linalg.LinAlgError as error:
+                raise BasisError(
+                    "the elastic stiffness is singular", hint="Use fewer kernels or more points."
+                ) from error
         basis, small = np.empty((size, 0)), np.zeros((BLOCK * steps, BLOCK * steps))
         block = np.random.default_rng(0).normal(size=(size, BLOCK))
         for end in range(BLOCK, BLOCK * steps + 1, BLOCK):

@@ -1,16 +1,19 @@
 """Orthonormal functions: the raw functions made orthonormal in mass, ordered, and split at exact regions.
 
 b = raw @ transform with (1 / V) sum_p V_p rho_p b_k b_l = delta_kl. Any rotation of such functions is as good, which
-is used twice: functions are ordered by the mean square of their gradient, and on a body with exact regions the first r
+is used twice: FreeForm's are ordered by the mean square of their gradient, and on a body with exact regions the first r
 ("driven") span all traces on the regions while the others vanish there.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import linalg
 
 from softmode.errors import BasisError
 
@@ -28,9 +31,28 @@ of 4e-7 with the five functions between the bounds and 3e-6 without them (nMSE, 
 KEPT_TOLERANCE = 1e-10
 """The bound for static responses. What eigenmodes lack in a response is small but decides its energy: under the
 bound above, the response of a clamped beam lost its anticlastic part and the beam was 20 % too stiff."""
+ROUNDING = 1e-24
+"""What is under this fraction of a function's mass is nothing but rounding, as where a soft region is told twice."""
 TRACE_TOLERANCE = 1e-6
 """Singular values of the traces on exact regions under this fraction of the largest count as zero. The weights vanish
 there by construction, so what lies between 1e-12 and 1e-3 is empty."""
+
+
+class RawFunctions(NamedTuple):
+    """Raw functions at the quadrature points of a body, and what these weigh."""
+
+    value: Array
+    """Values, shape (P, R)."""
+    gradient: Array
+    """Gradients [1/m], shape (P, R, 3)."""
+    mass: Array
+    """Fractions of mass V_p rho_p / V, shape (P,)."""
+    stiff: Array
+    """Fractions of volume times relative Young's modulus, shape (P,)."""
+
+    def products(self, index: NDArray[np.intp]) -> Array:
+        """Return the mass products of all functions with some of them, shape (R, len(index))."""
+        return self.value.T @ (self.mass[:, None] * self.value[:, index])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,75 +69,96 @@ class Functions:
     """Number r of functions that do not vanish on the exact regions; they come first."""
 
 
-def orthonormalise(
-    raw: Array,
-    raw_gradient: Array,
-    mass: Array,
-    stiff: Array,
-    *,
-    leading: NDArray[np.intp],
-    length: float,
-    kept: NDArray[np.bool_] | None = None,
-    held: bool = False,
-    rank_tolerance: float = RANK_TOLERANCE,
-    trace: Array | None = None,
-) -> Functions:
-    """Build the orthonormal functions.
+def independent(
+    raw: RawFunctions, lead: Array, groups: Sequence[tuple[NDArray[np.intp], float]]
+) -> tuple[Array, list[int]]:
+    """Return functions that are orthonormal in mass: those of `lead`, then what groups of raw functions add to them.
 
     Args:
-        raw: Raw functions at the quadrature points, (P, R).
-        raw_gradient: Their gradients [1/m], (P, R, 3).
-        mass: V_p rho_p / V, shape (P,).
-        stiff: Weights of the gradient energy that orders the functions, shape (P,).
-        leading: Raw functions that are kept whatever their size, the body's (x, y, z, 1) first.
-        length: Unit of length of the raw functions [m].
-        kept: Raw functions that come next and are dropped only when they repeat others to rounding, (R,); none when
-            None.
-        held: Whether the body has regions, which caps the rank tolerance at `HELD_RANK_TOLERANCE`.
-        rank_tolerance: Directions of the scaled mass Gram matrix under this fraction of the largest are dropped.
-        trace: Raw functions at points that fill the exact regions, (T, R); None without such regions.
+        raw: Raw functions.
+        lead: Functions = raw @ lead that come first, each within the span of those up to it, shape (R, f).
+        groups: Raw functions that come next, and for each group the fraction of the largest under which directions of
+            the scaled mass Gram matrix are dropped.
 
     Returns:
-        Functions: without `trace` 1, three linear ones, then the others by ascending mean square gradient; with it the
-        driven ones first, then the others likewise.
+        Functions = raw @ transform, (R, V), and how many there are up to the end of each group.
+    """
+    weighted = raw.value * np.sqrt(raw.mass)[:, None]
+    scale = 1.0 / np.maximum(np.linalg.norm(weighted, axis=0), 1e-300)
+    weighted *= scale
+    lead = lead / scale[:, None]
+    lead /= np.abs(lead).max(axis=0)
+    value, upper = np.linalg.qr(weighted @ lead)
+    sign = np.sign(np.diag(upper))
+    value *= sign
+    transform, counts = lead @ np.linalg.inv(upper * sign[:, None]), []
+    for i, (index, tolerance) in enumerate(groups):
+        if len(index):
+            rest, content = weighted[:, index], np.zeros((value.shape[1], len(index)))
+            for _ in range(2):
+                found = value.T @ rest
+                rest -= value @ found
+                content += found
+            size, vector = linalg.eigh(rest.T @ rest, check_finite=False)
+            keep = size > max(tolerance * size[-1], ROUNDING)
+            turn = vector[:, keep] / np.sqrt(size[keep])
+            part = np.zeros((weighted.shape[1], turn.shape[1]))
+            part[index] = turn
+            transform = np.concatenate([transform, part - transform @ (content @ turn)], axis=1)
+            if i + 1 < len(groups):  # What comes after must be apart from these.
+                value = np.concatenate([value, rest @ turn], axis=1)
+        counts.append(transform.shape[1])
+    return transform * scale[:, None], counts
+
+
+def split_at_regions(lead: Array, raw: RawFunctions, trace: Array) -> tuple[Array, Array]:
+    """Return functions that vanish on exact regions, and others of the same span that carry the regions.
+
+    Args:
+        lead: Functions = raw @ lead of affine motion, of the body and of its regions, shape (R, f); no others have
+            traces.
+        raw: Raw functions.
+        trace: Raw functions at points that fill the regions, (T, R).
+    """
+    lead = orthonormal_in_mass(lead, raw)
+    size, across = np.linalg.svd(np.linalg.qr(trace @ lead, mode="r"))[1:]
+    count = int((size > TRACE_TOLERANCE * size[0]).sum())
+    return lead @ across[count:].T, lead @ across[:count].T
+
+
+def orthonormalise(
+    raw: RawFunctions,
+    *,
+    lead: Array,
+    kept: NDArray[np.intp],
+    others: NDArray[np.intp],
+    rank_tolerance: float = RANK_TOLERANCE,
+) -> Array:
+    """Return all functions, orthonormal in mass, those after the first by ascending mean square gradient.
+
+    Args:
+        raw: Raw functions.
+        lead: Functions = raw @ lead that come first whatever their size, shape (R, f): 1, x, y, z of a body without
+            exact regions, else those of affine motion that vanish there.
+        kept: Raw functions that come next and are dropped only when they repeat others to rounding.
+        others: Raw functions that come last.
+        rank_tolerance: Directions of the scaled mass Gram matrix of the others under this fraction of the largest are
+            dropped.
+
+    Returns:
+        b = raw @ transform, shape (R, n).
 
     Raises:
         BasisError: If the weights add nothing to affine motion.
     """
-    gram = raw.T @ (mass[:, None] * raw)
-    total = len(gram)
-    lead = np.concatenate([leading[[3, 0, 1, 2]], leading[4:]])  # 1 first: then only it has a mean.
-    both = np.zeros((total, len(lead)))
-    both[lead] = np.linalg.inv(np.linalg.cholesky(gram[np.ix_(lead, lead)])).T
-    kept = np.zeros(total, dtype=bool) if kept is None else kept
-    others = np.ones(total, dtype=bool)
-    others[lead] = False
-    both = _extend(both, gram, np.flatnonzero(others & kept), KEPT_TOLERANCE)
-    bound = min(rank_tolerance, HELD_RANK_TOLERANCE) if held else rank_tolerance
-    both = _extend(both, gram, np.flatnonzero(others & ~kept), bound)
-    if both.shape[1] == len(lead):
+    found, _ = independent(raw, lead, [(kept, KEPT_TOLERANCE), (others, rank_tolerance)])
+    if found.shape[1] == lead.shape[1]:
         raise BasisError("the eigenmodes add nothing to affine motion", hint="Use more modes or kernels.")
-    both = orthonormal_in_mass(both, raw, mass)
-    # Both triangular factors keep the leading functions within the leading raw ones, and the first four within
-    # (1, x, y, z): there the linear functions are read off exactly.
-    linear = _linear_coordinates(both, leading, length)
-    mean = np.eye(1, both.shape[1])[0]
-    rotation, driven = np.eye(both.shape[1]), 0
-    if trace is not None:
-        size, across = np.linalg.svd(np.linalg.qr(trace @ both, mode="r"))[1:]
-        driven = int((size > TRACE_TOLERANCE * size[0]).sum())
-        rotation = across.T * np.sign(across.T[np.abs(across.T).argmax(axis=0), np.arange(len(across))])
-    fixed = driven if trace is not None else 4
-    if fixed < both.shape[1]:
-        energy = np.zeros((both.shape[1] - fixed,) * 2)
-        free = both @ rotation[:, fixed:]
-        for d in range(3):
-            slope = raw_gradient[:, :, d] @ free
-            energy += slope.T @ (stiff[:, None] * slope)
-        turn = np.linalg.eigh(energy)[1]
-        turn *= np.sign(turn[np.abs(turn).argmax(axis=0), np.arange(turn.shape[1])])
-        rotation[:, fixed:] = rotation[:, fixed:] @ turn
-    return Functions(transform=both @ rotation, mean=rotation.T @ mean, linear=rotation.T @ linear, driven_count=driven)
+    found, fixed = orthonormal_in_mass(found, raw), lead.shape[1]
+    slopes = [raw.gradient[:, :, d] @ found[:, fixed:] for d in range(3)]
+    turn = np.linalg.eigh(sum(slope.T @ (raw.stiff[:, None] * slope) for slope in slopes))[1]
+    turn *= np.sign(turn[np.abs(turn).argmax(axis=0), np.arange(turn.shape[1])])
+    return np.concatenate([found[:, :fixed], found[:, fixed:] @ turn], axis=1)
 
 
 def affine_first(transform: Array, leading: NDArray[np.intp], length: float) -> Functions:
@@ -126,64 +169,41 @@ def affine_first(transform: Array, leading: NDArray[np.intp], length: float) -> 
         leading: The raw functions x, y, z and 1.
         length: Unit of length of the raw functions [m].
     """
-    linear = _linear_coordinates(transform, leading, length)
+    linear = np.zeros((transform.shape[1], 4))
+    linear[:4] = np.linalg.solve(transform[leading[:4], :4], np.diag([length, length, length, 1.0]))
     return Functions(transform=transform, mean=np.eye(1, transform.shape[1])[0], linear=linear, driven_count=0)
 
 
-def driven_first(
-    driven: Array, free: Array, raw: Array, mass: Array, leading: NDArray[np.intp], length: float
-) -> Functions:
+def driven_first(driven: Array, free: Array, raw: RawFunctions, leading: NDArray[np.intp], length: float) -> Functions:
     """Return functions of a body with exact regions: those that carry the regions, then those that vanish there.
 
     Args:
         driven: Functions = raw @ driven that carry the regions, shape (R, r).
         free: Functions = raw @ free that vanish there, orthonormal in mass, shape (R, m); they stay as they are.
-        raw: Raw functions at the quadrature points, (P, R).
-        mass: V_p rho_p / V, shape (P,).
+        raw: Raw functions.
         leading: The raw functions x, y, z and 1, in the span of all.
         length: Unit of length of the raw functions [m].
     """
-    weighted = mass[:, None] * raw
+    weighted = raw.mass[:, None] * raw.value
     for _ in range(2):
-        driven = driven - free @ (free.T @ (weighted.T @ (raw @ driven)))
-    transform = np.concatenate([orthonormal_in_mass(driven, raw, mass), free], axis=1)
-    values, fields = raw @ transform, raw[:, leading[:4]]
+        driven = driven - free @ (free.T @ (weighted.T @ (raw.value @ driven)))
+    transform = np.concatenate([orthonormal_in_mass(driven, raw), free], axis=1)
+    values, fields = raw.value @ transform, raw.value[:, leading[:4]]
     linear = np.zeros((values.shape[1], 4))
     for _ in range(2):  # The second pass repairs rounding.
-        linear += values.T @ (mass[:, None] * (fields - values @ linear))
+        linear += values.T @ (raw.mass[:, None] * (fields - values @ linear))
     linear *= [length, length, length, 1.0]
     return Functions(transform=transform, mean=linear[:, 3].copy(), linear=linear, driven_count=driven.shape[1])
 
 
-def orthonormal_in_mass(transform: Array, raw: Array, mass: Array) -> Array:
+def orthonormal_in_mass(transform: Array, raw: RawFunctions) -> Array:
     """Return a transform (R, n) whose functions are orthonormal, from one whose functions nearly are.
 
     A pass against the functions themselves repairs what the squared condition number of a Gram matrix cost.
 
     Args:
         transform: b = raw @ transform, shape (R, n).
-        raw: Raw functions at the quadrature points, (P, R).
-        mass: V_p rho_p / V, shape (P,).
+        raw: Raw functions.
     """
-    values = raw @ transform
-    return transform @ np.linalg.inv(np.linalg.cholesky(values.T @ (mass[:, None] * values))).T
-
-
-def _linear_coordinates(transform: Array, leading: NDArray[np.intp], length: float) -> Array:
-    """Return c (n, 4) with sum_k b_k c_kj = (X, Y, Z, 1)_j, where the first four functions span (x, y, z, 1)."""
-    linear = np.zeros((transform.shape[1], 4))
-    linear[:4] = np.linalg.solve(transform[leading[:4], :4], np.diag([length, length, length, 1.0]))
-    return linear
-
-
-def _extend(basis: Array, gram: Array, index: NDArray[np.intp], tolerance: float) -> Array:
-    """Add what raw functions hold beyond an orthonormal basis (R, n), down to a tolerance of the Gram matrix."""
-    if not len(index):
-        return basis
-    rest = np.eye(len(gram))[:, index]
-    for _ in range(2):
-        rest = rest - basis @ (basis.T @ (gram @ rest))
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(gram)[index], 1e-300))
-    value, vector = np.linalg.eigh((rest.T @ gram @ rest) * scale[:, None] * scale)
-    keep = value > tolerance * value[-1]
-    return np.concatenate([basis, rest @ (scale[:, None] * vector[:, keep] / np.sqrt(value[keep]))], axis=1)
+    values = raw.value @ transform
+    return transform @ np.linalg.inv(np.linalg.cholesky(values.T @ (raw.mass[:, None] * values))).T

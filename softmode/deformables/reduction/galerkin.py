@@ -65,8 +65,8 @@ def elastic_matrix(shape: ShapeFunctions, weights: Array, mu: float, lame: float
                 if a == b:
                     block = block + mu * trace
                 found[a, :, b, :][pick] += block
-                if a != b:
-                    found[b, :, a, :][pick] += block.T
+    for a, b in ((1, 0), (2, 0), (2, 1)):
+        found[b, :, a] = found[a, :, b].T
     return found.reshape(3 * count, 3 * count)
 
 

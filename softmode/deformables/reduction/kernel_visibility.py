@@ -164,7 +164,7 @@ def divide_at_gaps(
         if detours is not None and octants is not None:
             detours = more_detours(octants, detours, divided.centres, divided.support, first)
         if hidden is not None:  # Those before see what they saw.
-            hidden += _hidden(material, divided.centres, divided.support, first)
+            hidden += hidden_points(material, divided.centres, divided.support, first)
         divided = replace(
             divided, detours=detours, visibility=None if hidden is None else _visibility(material, hidden)
         )
@@ -179,24 +179,20 @@ def divide_at_gaps(
     return kernels
 
 
-def find_visibility(material: Material, centres: Array, support: Array) -> Visibility | None:
-    """Return what kernels do not act on; None if all of them act on all that they reach.
-
-    Args:
-        material: The graph of the object's points.
-        centres: Kernel centres, points of the material [m], shape (K, 3).
-        support: Support radii [m], shape (K,).
-    """
-    return _visibility(material, _hidden(material, centres, support, 0))
-
-
 def _visibility(material: Material, hidden: list[Indices]) -> Visibility | None:
     """Return what kernels do not act on, from pairs of a kernel and a point as one number; None without any."""
     return Visibility(points=material.points, hidden=np.sort(np.concatenate(hidden))) if hidden else None
 
 
-def _hidden(material: Material, centres: Array, support: Array, first: int) -> list[Indices]:
-    """Return the points that kernels from the first on reach and do not act on: kernel * N + point, chunk by chunk."""
+def hidden_points(material: Material, centres: Array, support: Array, first: int = 0) -> list[Indices]:
+    """Return the points that kernels from the first on reach and do not act on: kernel * N + point, chunk by chunk.
+
+    Args:
+        material: The graph of the object's points.
+        centres: Kernel centres, points of the material [m], shape (K, 3).
+        support: Support radii [m], shape (K,).
+        first: The first of these kernels.
+    """
     found = []
     for mine in _chunks(material, len(centres), first):
         points, lumps = material.distances(centres[mine])
@@ -221,7 +217,7 @@ def _narrowing(material: Material, kernels: BasisRKPM) -> tuple[Array, list[Indi
     Sides that are not connected within a support may be within a larger one.
 
     Returns:
-        The fractions (K,), and what the kernels do not act on with these supports, as `_hidden` does.
+        The fractions (K,), and what the kernels do not act on with these supports, as `hidden_points` does.
     """
     factor, gaps, hidden = np.full(kernels.kernel_count, NARROWER[0]), False, []
     for mine in _chunks(material, kernels.kernel_count):

@@ -98,7 +98,7 @@ def _octant_edges(cells: Cells) -> Array:
 
 
 def sample_regions(
-    regions: Sequence[Region], pieces: Pieces, offset: Array, stiffness: Array, spacing: float
+    regions: Sequence[Region], pieces: Pieces, offset: Array, stiffness: Array, spacing: float, bounds: Array
 ) -> RegionSamples:
     """Sample regions by the cells of a quadrature; exact ones also by corners, so that a layer of cells has thickness.
 
@@ -108,9 +108,10 @@ def sample_regions(
         offset: What is taken from its points [m], shape (3,).
         stiffness: Their relative Young's modulus, shape (P,): springs of a soft region are as stiff as what they hold.
         spacing: Edge of their cells [m].
+        bounds: Of the object, less the offset [m], shape (2, 3).
 
     Warns:
-        RuntimeWarning: If a region is thinner than the cells there, or soft ones overlap.
+        RuntimeWarning: If a region is thinner than the cells there, or a soft one overlaps another.
 
     Raises:
         ConfigError: If two regions have one name.
@@ -125,22 +126,24 @@ def sample_regions(
     for i, region in enumerate(regions):
         place, volume = region.integrate(points, weights, pieces.edges, pieces.axes)
         distance, _, width, share = region.cut(points, pieces.edges, pieces.axes)
-        inside, taken = distance <= 0.0, held if region.stiffness is None else sprung
-        if (taken[inside] >= 0).any():
-            both = f"regions {names[taken[inside].max()]!r} and {region.name!r} overlap"
-            if region.stiffness is None:
+        inside, exact = distance <= 0.0, region.stiffness is None
+        taken = held if exact else sprung
+        for other in (other for other in (held, sprung) if (other[inside] >= 0).any()):
+            both = f"regions {names[other[inside].max()]!r} and {region.name!r} overlap"
+            if exact and other is held:
                 raise BasisError(both, hint="Merge them or make one soft.")
-            warnings.warn(f"{both}: their springs add up there", RuntimeWarning, stacklevel=4)
+            what = "their springs add up there" if other is taken else "springs do nothing where one is held exactly"
+            warnings.warn(f"{both}: {what}", RuntimeWarning, stacklevel=4)
         taken[inside] = i
         edge = float(np.median(np.append(0.0, width[(share > 0.02) & (width > 0.0)])))
-        if region.thickness < edge:
+        if (thickness := region.thickness(bounds)) < edge:
             warnings.warn(
-                f"region {region.name!r} is {1e3 * region.thickness:.2g} mm thick, the cells there {1e3 * edge:.2g} mm:"
+                f"region {region.name!r} is {1e3 * thickness:.2g} mm thick, the cells there {1e3 * edge:.2g} mm:"
                 " what it holds is coarse; enlarge it, or take more quadrature points",
                 RuntimeWarning,
                 stacklevel=4,
             )
-        if region.stiffness is None:
+        if exact:
             corner = region.corners(place, spacing)
             place, volume = np.concatenate([place, corner]), np.concatenate([volume, np.zeros(len(corner))])
         else:
@@ -151,9 +154,9 @@ def sample_regions(
     if (held >= 0).all():
         raise BasisError("the exact regions hold the whole body", hint="Regions are given in asset coordinates.")
     found = np.concatenate(index)
-    exact = np.array([region.stiffness is None for region in regions], dtype=bool)
+    rigid = np.array([region.stiffness is None for region in regions], dtype=bool)
     return RegionSamples(
-        points=np.concatenate(places), index=found, weights=np.concatenate(volumes), exact=exact[found]
+        points=np.concatenate(places), index=found, weights=np.concatenate(volumes), exact=rigid[found]
     )
 
 

@@ -15,8 +15,9 @@ from scipy.spatial import ConvexHull, QhullError
 
 from softmode.deformables.quadrature.interior import Interior, interior_from_quadrature, interior_from_surface
 from softmode.deformables.quadrature.occupancy import KEPT_EXTENT, KEPT_SHARE
+from softmode.deformables.reduction.basis import KERNEL_POINTS
 from softmode.deformables.reduction.cubature import POISSON_RATIO
-from softmode.deformables.reduction.elastic_functions import SPACE_WARNING
+from softmode.deformables.reduction.elastic_functions import EXCESS, EXCESS_WARNING
 from softmode.deformables.reduction.functions import RANK_TOLERANCE
 from softmode.deformables.reduction.reduced_stiffness import elastic_modes, reduced_stiffness
 from softmode.errors import BasisError
@@ -34,10 +35,6 @@ STRAIN = 0.1
 """Strain (root mean square over the body) at which the Jacobian of a mode is measured."""
 CONDITION_WARNING = 1e6
 """Condition number of a moment matrix from which on gradients lose more digits than float32 has to spare."""
-KERNEL_POINTS = 3
-"""Quadrature points for every kernel below which a body may be too soft."""
-FREQUENCY_WARNING = 0.05
-"""Error of the first frequencies, against the space that functions are chosen from, above which a body is too stiff."""
 SLENDER = 0.3
 """Ratio of the least to the largest extent under which affine handles lock a body in bending."""
 BARE = 3.0
@@ -255,32 +252,10 @@ def _check_geometry(body: ReducedBody, notes: _Notes) -> None:
             f"its {kernels} kernels move between {points} quadrature points at no cost of energy: too soft",
             "build it with more points, or without a number of kernels",
         )
-    error = body.provenance.get("frequency_error")
-    if error is not None and float(notes.measure("error of the first frequencies", float(error))) > FREQUENCY_WARNING:
-        notes.find(
-            "warning",
-            "functions",
-            f"its first six frequencies are up to {100.0 * float(error):.0f} % too high with {body.function_count}"
-            " functions",
-            "build it with --accuracy 0.03, or more --functions",
-        )
-    space = float(body.provenance.get("space_error") or 0.0)
-    if notes.measure("second half of the space", space) > SPACE_WARNING:
-        notes.find(
-            "warning",
-            "space",
-            f"corners, branches or thin walls that its kernels do not resolve: its first six frequencies may be"
-            f" {100.0 * space:.0f} % too high, whatever the number of functions",
-            "build it with twice the points (--points): more points allow narrower kernels",
-        )
-    driven = body.provenance.get("driven_error")
-    if driven is not None and notes.measure("excess of stiffness between regions", float(driven)) > SPACE_WARNING:
-        notes.find(
-            "warning",
-            "regions",
-            f"its regions may resist each other's motion {100.0 * float(driven):.0f} % too much",
-            "build it with twice the points (--points), or more --functions",
-        )
+    for key, (measure, finding, what, remedy) in EXCESS.items():
+        excess = body.provenance.get(key)
+        if excess is not None and notes.measure(measure, float(excess)) > EXCESS_WARNING:
+            notes.find("warning", finding, f"{key} {100.0 * float(excess):.0f} %: {what}", remedy)
     complete = body.provenance.get("complete_functions")
     if isinstance(complete, float) and complete > body.function_count + 1:  # A pair may be near each other by chance.
         notes.find(
@@ -290,26 +265,17 @@ def _check_geometry(body: ReducedBody, notes: _Notes) -> None:
             f" {complete:.0f} would have all of it",
             f"build it with --functions {complete:.0f}",
         )
-    if error is not None or body.regions.names:
+    if "frequency_error" in body.provenance or body.regions.names:
         return
-    degrees = body.handles.degrees
-    tolerance = body.provenance.get("option_rank_tolerance")
-    if slender < SLENDER and not (degrees == 2).any():
-        notes.find(
-            "warning",
-            "slender",
-            f"the body is slender or flat ({slender:.2f} of its length) and has affine handles, which make it a third"
-            " too stiff in bending",
-            "leave --modes and --handles away: then its functions are chosen by elastic energy",
-        )
-    elif slender < SLENDER and tolerance is not None and float(tolerance) >= RANK_TOLERANCE:
-        notes.find(
-            "warning",
-            "slender",
-            f"the body is slender or flat ({slender:.2f} of its length), and a rank tolerance of {float(tolerance):.0e}"
-            " takes the thin functions of its bending for noise",
-            "build it with --rank-tolerance 1e-9",
-        )
+    affine = not (body.handles.degrees == 2).any()
+    tolerance = float(body.provenance.get("option_rank_tolerance") or 0.0)
+    if slender < SLENDER and (affine or tolerance >= RANK_TOLERANCE):
+        what = " and has affine handles, which make it a third too stiff in bending"
+        remedy = "leave --modes and --handles away: then its functions are chosen by elastic energy"
+        if not affine:
+            what = f", and a rank tolerance of {tolerance:.0e} takes the thin functions of its bending for noise"
+            remedy = "build it with --rank-tolerance 1e-9"
+        notes.find("warning", "slender", f"the body is slender or flat ({slender:.2f} of its length){what}", remedy)
 
 
 def _check_shape(body: ReducedBody, notes: _Notes) -> None:

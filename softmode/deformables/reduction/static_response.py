@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy import linalg, sparse
 
 from softmode.deformables.body.rkpm import ShapeFunctions
-from softmode.deformables.reduction.galerkin import elastic_matrix, mass_and_gradient_matrix
+from softmode.deformables.reduction.galerkin import elastic_matrix, mass_and_gradient_matrix, mass_matrix
 from softmode.errors import BasisError
 
 Array = NDArray[np.float64]
@@ -78,7 +78,7 @@ def solve_static_responses(
     solve = _factor(matrix)
     response = solve(np.kron(np.eye(3), (shape.value.T @ (weights * density))[:, None]))
     first = response.reshape(3, count, 3).transpose(2, 0, 1).reshape(9, count)
-    mass, energy = mass_and_gradient_matrix(shape, weights / weights.sum(), stiff)
+    mass = mass_matrix(shape, weights / weights.sum())
     size = np.sqrt(np.einsum("ik,kl,il->i", first, mass, first, optimize=True))
     parts = [first[size > NEGLIGIBLE * size.max()]]
     if mode_count:
@@ -86,6 +86,7 @@ def solve_static_responses(
         part = np.sqrt(np.einsum("ik,kl,il->i", modes, mass, modes, optimize=True))
         parts.append(modes[part > MODE_LEAST * part.max()])
     if derivative_count:
+        energy = mass_and_gradient_matrix(shape, weights, stiff)[1]
         load = second_order_load(shape.gradient, stiff, response.T.reshape(3, 3, count), poissons_ratio)[0]
         second = solve(load).reshape(3, count, -1).transpose(2, 0, 1).reshape(-1, count)
         # Without what the first order holds, in the gradient energy, and the rest by its share of that energy.
@@ -140,45 +141,33 @@ def second_order_load(
         strain = 0.5 * (matrix + matrix.transpose(0, 2, 1))
         return lame * np.trace(strain, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 2.0 * mu * strain
 
-    loads = []
+    stresses = []
     for i in range(3):
         for j in range(i, 3):
             h, k = slopes[i], slopes[j]
-            p = (stress(h.transpose(0, 2, 1) @ k) + k @ stress(h) + h @ stress(k)) * stiff[:, None, None]
-            loads.append(-np.sum([(g.T @ p[:, :, d]).T for d, g in enumerate(gradient)], axis=0).ravel())
-    return np.array(loads).T, np.array(sizes)
+            stresses.append((stress(h.transpose(0, 2, 1) @ k) + k @ stress(h) + h @ stress(k)) * stiff[:, None, None])
+    all_of_them = np.concatenate(stresses, axis=1)  # (P, pair and component, axis): each gradient is read once.
+    loads = -np.sum([g.T @ np.ascontiguousarray(all_of_them[:, :, d]) for d, g in enumerate(gradient)], axis=0)
+    return loads.T.reshape(len(stresses), -1).T, np.array(sizes)
 
 
 def solve_harmonic_weights(
-    shape: ShapeFunctions,
-    weights: Array,
-    *,
-    blend_gradient: Array,
-    stiffness_scale: Array,
-    springs: Array,
-    spring_load: Array,
+    shape: ShapeFunctions, weights: Array, *, stiffness_scale: Array, springs: Array, spring_load: Array
 ) -> Array:
-    """Find the weights of regions: one on a region, zero on the others, of least gradient energy between.
-
-    They serve a body with a soft region. The weight is T + sum_k c_k phi_k with T the blend of an exact
-    region, on all of which the kernels vanish, and T = 0 for a soft one, whose springs pull W to one.
+    """Find the weights of soft regions: one on a region, zero on the others, of least gradient energy between.
 
     Args:
         shape: Kernels at the quadrature points, (P, K), vanishing on all exact regions.
         weights: Quadrature weights [m^3], shape (P,).
-        blend_gradient: grad T [1/m], shape (P, C, 3).
         stiffness_scale: Relative Young's modulus, shape (P,).
-        springs: sum_r kappa / (lambda + 4 mu) V_r phi phi^T [m] of soft regions, shape (K, K).
-        spring_load: sum_r kappa / (lambda + 4 mu) V_r phi (w_r - T_r) [m] with w the value that the region of r asks
-            of the weight, shape (K, C).
+        springs: sum_r kappa / (lambda + 4 mu) V_r phi phi^T [m], shape (K, K).
+        spring_load: Of each soft region its kappa / (lambda + 4 mu) V_r phi [m], shape (K, C).
 
     Returns:
-        Coefficients c, shape (K, C).
+        Coefficients in the kernels, shape (K, C).
     """
-    stiff = weights * stiffness_scale
-    _, energy = mass_and_gradient_matrix(shape, weights, stiff)
-    load = -np.sum([g.T @ (stiff[:, None] * blend_gradient[:, :, d]) for d, g in enumerate(shape.gradient)], axis=0)
-    return _factor(energy + springs)(load + spring_load)
+    energy = mass_and_gradient_matrix(shape, weights, weights * stiffness_scale)[1]
+    return _factor(energy + springs)(spring_load)
 
 
 def _factor(matrix: Array) -> Callable[[Array], Array]:
@@ -189,7 +178,7 @@ def _factor(matrix: Array) -> Callable[[Array], Array]:
     for ridge in (0.0, 1e-12 * typical):  # The second for kernels that (numerically) repeat each other.
         matrix[diagonal] += ridge
         try:
-            factor = linalg.cho_factor(matrix, check_finite=False)
+            factor = linalg.cho_factor(matrix.T, lower=True, check_finite=False)
         except linalg.LinAlgError:
             continue
         return lambda load: linalg.cho_solve(factor, load, check_finite=False)

@@ -49,7 +49,7 @@ def record_press(scene: TableScene, displacement: float) -> Press:
     config, body = scene.config, scene.soft.body
     gripper, control = config.arm.gripper, config.control
     top = body.evaluate(np.array([[0.0, 0.0, body.surface.points[:, 2].max()]]))[0][0]
-    action = np.zeros((scene.world_count, control.action_size), np.float32)
+    action = np.zeros((scene.world_count, scene.controller.action_size), np.float32)
     action[:, -1] = 2.0 * config.arm.home_opening / gripper.stroke - 1.0
     start, first = (
         int(a.numpy()[0]) for a in (scene.model.softmode.function_start, scene.model.softmode.particle_start)
