@@ -15,7 +15,16 @@ import gymnasium as gym
 import numpy as np
 
 from softmode import __version__
-from softmode.errors import CheckpointError, ConfigError, MissingExtraError, RunError, TrainingDiverged, needs_extra
+from softmode.errors import (
+    CheckpointError,
+    ConfigError,
+    MissingExtraError,
+    RunError,
+    SoftmodeError,
+    TrainingDiverged,
+    WorkerError,
+    needs_extra,
+)
 
 with needs_extra("rl", "training needs torch"):
     import torch
@@ -53,6 +62,7 @@ def train(options: TrainOptions, *, make: MakeVectorEnv = make_vector_env, repor
         CheckpointError: If the checkpoint to start from cannot be used.
         RunError: If the folder exists, is missing, or cannot be written; earlier checkpoints stay intact.
         TrainingDiverged: If a value is not finite; earlier checkpoints stay intact.
+        WorkerError: If another process of the run is lost; the last whole iteration is kept.
     """
     device = local_device(options.device)
     ranks = Ranks.start(device)
@@ -266,15 +276,22 @@ class _Run:
         try:
             try:
                 self._iterate()
-            except RuntimeError:
+            except RuntimeError as error:
                 time.sleep(1.0)  # what ends all processes of a run may end one that this one waits for before this one
-                raise
+                if self.ranks.count == 1 or isinstance(error, SoftmodeError):
+                    raise
+                what = f"a process of the run was lost {self._keep()} ({str(error).partition(chr(10))[0]})"
+                raise WorkerError(what, hint=f"go on with --run-dir {self.folder.path} --resume") from error
         except KeyboardInterrupt:
             if self.ranks.rank == 0:
-                self._save(self._kept)
-                done = f"interrupted after iteration {self._kept.progress['iteration']}"
-                self.report(f"{done}; go on with --run-dir {self.folder.path} --resume")
+                self.report(f"interrupted {self._keep()}; go on with --run-dir {self.folder.path} --resume")
             raise
+
+    def _keep(self) -> str:
+        """Write the last whole iteration, on the first rank, and say which it is."""
+        if self.ranks.rank == 0:
+            self._save(self._kept)
+        return f"after iteration {self._kept.progress['iteration']}"
 
     def _iterate(self) -> None:
         """Collect and update until a limit is reached."""

@@ -47,8 +47,31 @@ np.savez(folder / f"rank{rank}.npz", steps=result.env_steps, **found)
 """What each process does: an update of its share, then training of its worlds."""
 
 
-def torchrun(folder: Path, processes: int = 2) -> None:
-    """Run the code in processes that know of each other as torchrun's do."""
+LOST = """
+import os, signal, sys
+from pathlib import Path
+from softmode.errors import WorkerError
+from softmode.learning import trainer
+from tests.learning.test_runs import run
+update = trainer._Run._update
+def die(self, *given):
+    if self.ranks.rank == 1 and self.iteration == 3:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return update(self, *given)
+trainer._Run._update = die
+try:
+    run(Path(sys.argv[1]) / "lost", 1 << 20, checkpoint_seconds=1e9)
+except WorkerError as error:
+    print("told:", error)
+"""
+"""One process is killed in the third iteration, in which the other one waits for it."""
+
+
+def torchrun(folder: Path, code: str = CODE, processes: int = 2) -> list[str]:
+    """Run the code in processes that know of each other as torchrun's do, each on a machine of its own.
+
+    Returns what each said, with its exit status.
+    """
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = str(probe.getsockname()[1])
@@ -56,16 +79,15 @@ def torchrun(folder: Path, processes: int = 2) -> None:
     environment |= {"MASTER_PORT": port, "WORLD_SIZE": str(processes)}
     started = [
         subprocess.Popen(
-            [sys.executable, "-c", CODE, str(folder)],
-            env={**environment, "RANK": str(rank), "LOCAL_RANK": str(rank)},
+            [sys.executable, "-c", code, str(folder)],
+            env={**environment, "RANK": str(rank), "LOCAL_RANK": "0"},
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
         )
         for rank in range(processes)
     ]
-    outputs = [process.communicate()[0] for process in started]
-    assert all(process.returncode == 0 for process in started), "\n".join(outputs)
+    return [f"{process.communicate()[0]}exit {process.returncode}" for process in started]
 
 
 def updated(ranks: Ranks) -> np.ndarray:
@@ -103,7 +125,8 @@ def updated(ranks: Ranks) -> np.ndarray:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return where two processes have left what they hold."""
     made = tmp_path_factory.mktemp("ranks")
-    torchrun(made)
+    told = torchrun(made)
+    assert all(text.endswith("exit 0") for text in told), "\n".join(told)
     return made
 
 
@@ -136,3 +159,14 @@ def test_two_processes_update_as_one_with_all_worlds(ranks: list[Any]):
     alone = updated(Ranks())
     # Adam's first step is the learning rate times the sign of the gradient, whose rounding errs by 1e-6 at most.
     np.testing.assert_allclose(first, alone, rtol=0.0, atol=2e-5)
+
+
+@pytest.mark.rest
+def test_a_lost_process_ends_the_run_with_its_last_iteration(tmp_path: Path):
+    """The other one says what was lost and how to go on, and its checkpoint is whole."""
+    from softmode.learning.checkpoints import read_checkpoint
+
+    first, second = torchrun(tmp_path, LOST)
+    assert "told: a process of the run was lost after iteration 2" in first and first.endswith("exit 0")
+    assert "--resume" in first and second.endswith("exit -9")
+    assert read_checkpoint(tmp_path / "lost" / "latest.npz").progress["iteration"] == 2
