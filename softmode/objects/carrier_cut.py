@@ -65,10 +65,10 @@ def cut_at(sections: Sections, boundary: Boundary, gap: float) -> Cut:
     x, normal, pitch = surface.points, surface.normals, surface.pitch
     i, j = sections.cells_of(x)
     height, shift, reach, rough = x[:, 2] - boundary.height, np.zeros(3), 0.5 * sections.layer, False
+    span = max((boundary.reach + 1.5) * sections.layer, 0.03 * sections.size)
+    within: Any = ndimage.binary_dilation(contact, iterations=2)
+    outside = ~within[i, j]
     if boundary.kind == "top":
-        span = max((boundary.reach + 1.5) * sections.layer, 0.03 * sections.size)
-        within: Any = ndimage.binary_dilation(contact, iterations=2)
-        outside = ~within[i, j]
         flat = np.flatnonzero(outside & (np.abs(height) < span) & (np.abs(normal[:, 2]) > 0.8))
         spread = 0.5 * pitch
         if len(flat) > 10:
@@ -85,7 +85,7 @@ def cut_at(sections: Sections, boundary: Boundary, gap: float) -> Cut:
     lying = (np.abs(height) <= reach) & (np.abs(normal[:, 2]) > 0.75)
     if rough:
         core: Any = ndimage.binary_erosion(contact, iterations=2)
-        covered = sections.solid[sections.layer_of(boundary.height + 2.0 * span) :].any(axis=0)
+        covered: Any = sections.solid[sections.layer_of(boundary.height + 2.0 * span) :].any(axis=0)
         low = (np.abs(height) < 2.0 * span) & (np.abs(normal[:, 2]) > 0.8) & ~covered[i, j]
         sheet = _sheet(surface, np.flatnonzero(low), outside)
         lying = (lying & ~(core[i, j] & (height > 0.3 * reach))) | sheet
