@@ -302,7 +302,7 @@ def array_seeds(folder: Path) -> Seeds:
     from softmode.objects.object_file import write_object
     from softmode.view.live_recording import LiveRecording
     from tests.bodies import cube
-    from tests.radiance.test_grid import plenoxels, small
+    from tests.radiance.test_grid import plenoctree, plenoxels, small
     from tests.radiance.test_nanovdb import with_checksums
     from tests.splats.test_splats import random_splats
 
@@ -350,7 +350,7 @@ def array_seeds(folder: Path) -> Seeds:
         "morph": (".npz", "zip", [(folder / "morph.npz").read_bytes()]),
         "recording": (".npz", "zip", [(folder / "recording.npz").read_bytes()]),
         "state": (".npz", "zip", [(folder / "state.npz").read_bytes()]),
-        "radiance": (".npz", "zip", [_npz(True, **small()), _npz(**plenoxels()), _npz(**plain)]),
+        "radiance": (".npz", "zip", [_npz(True, **small()), _npz(**plenoxels()), _npz(**plenoctree()), _npz(**plain)]),
         "nanovdb": (".nvdb", "nvdb", [(folder / "none").read_bytes(), with_checksums((folder / "none").read_bytes())]),
     }
     if "checkpoint" not in absent():

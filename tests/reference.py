@@ -186,28 +186,23 @@ def penalty(p: np.ndarray, eps: float) -> np.ndarray:
     return np.where(p < eps, p**3 / (6 * eps), p * p / 2 - eps * p / 2 + eps * eps / 6)
 
 
-def dent(penetration: np.ndarray, eps: float | np.ndarray, ratio: float | np.ndarray) -> np.ndarray:
-    """Return the dent p - x at the minimum over x of penalty(x) + (p - x)^2 / (2 ratio), by bisection [m]."""
-    p = np.maximum(penetration, 0.0)
-    low, high = np.zeros_like(p), p.copy()
-    for _ in range(200):
-        x = 0.5 * (low + high)
-        deep = x + ratio * np.where(x < eps, x * x / (2 * eps), x - eps / 2) > p
-        low, high = np.where(deep, low, x), np.where(deep, x, high)
-    return p - x
-
-
 def dented_penalty(penetration: np.ndarray, eps: float, ratio: float) -> np.ndarray:
-    """Return min_x penalty(x) + (p - x)^2 / (2 ratio)."""
-    if ratio == 0.0:
-        return penalty(penetration, eps)
-    v = dent(penetration, eps, ratio)
-    return penalty(np.maximum(penetration, 0.0) - v, eps) + v**2 / (2 * ratio)
+    """Return the mean over gaps x in [0, eps] of min_v (p - x - v)^2 / 2 + v^2 / (2 ratio), by Gauss's rule.
+
+    Of two springs in series, v the dent; nothing where p < x.
+    """
+    x, weight = np.polynomial.legendre.leggauss(8)
+    p = np.maximum(np.asarray(penetration), 0.0)
+    reach = np.minimum(p, eps)  # gaps beyond p are open
+    deep = p[..., None] - 0.5 * reach[..., None] * (x + 1.0)
+    v = ratio / (1.0 + ratio) * deep
+    energy = 0.5 * (deep - v) ** 2 + (v**2 / (2.0 * ratio) if ratio else 0.0)
+    return reach / eps * (0.5 * weight * energy).sum(axis=-1)
 
 
 def normal_potential(penetration: np.ndarray, eps: float, ratio: float = 0.0, depth: float = 0.0) -> np.ndarray:
-    """Return the contact potential per unit stiffness: a dented penalty, one nine times as stiff from depth + 2 eps."""
-    return dented_penalty(penetration, eps, ratio) + 9.0 * penalty(penetration - depth - 2.0 * eps, 2.0 * eps)
+    """Return the contact potential per unit stiffness: a dented penalty, one nine times as stiff from ``depth`` on."""
+    return dented_penalty(penetration, eps, ratio) + 9.0 * penalty(penetration - depth, 2.0 * eps)
 
 
 def friction_potential(y: np.ndarray, eps: float) -> np.ndarray:
@@ -215,9 +210,15 @@ def friction_potential(y: np.ndarray, eps: float) -> np.ndarray:
     return np.where(y < eps, y * y / eps - y**3 / (3 * eps**2) + eps / 3, y)
 
 
-def stick_potential(y: np.ndarray, limit: float, stiffness: float) -> np.ndarray:
-    """Return the energy [J] of a spring that slips at the force limit: k y^2 / 2, then limit (y - limit / (2 k))."""
-    return np.where(stiffness * y <= limit, 0.5 * stiffness * y * y, limit * (y - 0.5 * limit / stiffness))
+def stick_potential(y: np.ndarray, limit: float, stiffness: float, deep: float, depth: float) -> np.ndarray:
+    """Return the energy [J] of a spring that slips at the force limit: the integral of min(force, limit).
+
+    The force is k y up to a tenth of the dent, and grows by ``deep`` from there on.
+    """
+    bend = 0.1 * depth
+    most = limit / stiffness if limit <= stiffness * bend else bend + (limit - stiffness * bend) / deep
+    x = np.minimum(y, most)
+    return 0.5 * stiffness * x**2 + 0.5 * (deep - stiffness) * np.maximum(x - bend, 0.0) ** 2 + limit * (y - x)
 
 
 def contact_stiffness(
@@ -225,7 +226,7 @@ def contact_stiffness(
 ) -> float:
     """Return the automatic contact stiffness per area [Pa/m].
 
-    The largest of 400 M / L (P-wave modulus over size), 100 m_eff / (A dt^2) with 1/m_eff = 1/m + 1/m_partner and A the
+    The largest of 150 M / L (P-wave modulus over size), 100 m_eff / (A dt^2) with 1/m_eff = 1/m + 1/m_partner and A the
     smaller surface, and 1e8.
     """
     E, nu = material.youngs_modulus, material.poissons_ratio
@@ -233,7 +234,7 @@ def contact_stiffness(
     size = float(np.linalg.norm(np.ptp(body.bounds, axis=0)))
     mass = 1.0 / (1.0 / (material.density * body.volume) + 1.0 / partner_mass)
     area = min(float(body.surface.areas.sum()), partner_area)
-    return max(400.0 * wave / size, 100.0 * mass / (area * dt**2), 1.0e8)
+    return max(150.0 * wave / size, 100.0 * mass / (area * dt**2), 1.0e8)
 
 
 def distance_plane(x: np.ndarray) -> np.ndarray:

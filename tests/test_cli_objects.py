@@ -441,6 +441,7 @@ COMMANDS = (
     "body cut",
     "radiance info",
     "radiance bake",
+    "radiance sample",
     "objects list",
     "objects show",
     "objects export",

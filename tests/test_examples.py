@@ -16,6 +16,7 @@ EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 NEEDS = {
     "behaviour_cloning": "torch",
     "train_cleanrl": "torch",
+    "train_field": "torch",
     "train_own_toy": "torch",
     "train_rsl_rl": "rsl_rl",
     "train_sb3": "stable_baselines3",

@@ -33,16 +33,17 @@ class _Asset:
     """Splats (.ply, .splat, .spz, .sog, meta.json, .usd, ...), a mesh (.glb, .obj, .stl, .usd, ...) or a point cloud
     (.npz with points, normals, colors; .ply), or a preset's name; --splat and --object name one too."""
     functions: int | None = None
-    """Scalar functions, chosen by elastic energy; 48 if omitted."""
+    """Functions chosen by elastic energy; 48 if omitted."""
     accuracy: float | None = None
     """Or as many as the first six frequencies take to be this near to those of the whole space, such as 0.02."""
     modes: int | None = None
-    """FreeForm's functions instead: so many skinning eigenmodes beside the constant handle."""
-    handles: Literal["affine", "quadratic", "local"] | None = None
-    """What each eigenmode carries: (X, Y, Z, 1), or all ten monomials up to degree two, for slender and flat bodies; or
-    local handles in their place."""
+    """FreeForm's instead: so many eigenmodes beside the constant handle."""
+    handles: Literal["affine", "quadratic", "local", "qgmls"] | None = None
+    """What each carries: (X, Y, Z, 1), or ten monomials; or local handles, or Q-GMLS, in their place."""
     local_count: int | None = None
-    """Number of local handles; 16 if omitted."""
+    """Local handles, or kernels of Q-GMLS; 16 if omitted."""
+    kernels_at: tuple[str, ...] = ()
+    """X,Y,Z,RADIUS of more of them [m]."""
     kernels: int | None = None
     """Reproducing kernels; 1000 if omitted, 400 with eigenmodes."""
     points: int = 384
@@ -50,17 +51,16 @@ class _Asset:
     surface: int | None = None
     """Surface samples, which feel contact; 800 if omitted."""
     splats: int | None = None
-    """Splats on a mesh, 2000 if omitted, or on a preset, 6000; a splat file keeps its own."""
+    """Splats on a mesh, 2000 if omitted, or on a preset, 6000."""
     rank_tolerance: float | None = None
     """Functions smaller than this are dropped as noise; 1e-5 if omitted, 1e-9 for slender and flat bodies."""
     poissons_ratio: tuple[float, ...] = ()
-    """Poisson's ratio that the functions are made for; a preset's own, else 0.4, if omitted. Any other can be
-    simulated, several serve one that varies."""
+    """Poisson's ratio of the functions, a preset's own, else 0.4, if omitted; several serve one that varies."""
     region: tuple[str, ...] = ()
-    """NAME=x0,y0,z0,x1,y1,z1: a part that scenes hold, move or grasp [m]; a seventh number makes it soft, stiffness / E
-    [1/m^2]. Coordinates: z up, bounding box centred over the origin, standing on z = 0; inf is allowed."""
+    """NAME=x0,y0,z0,x1,y1,z1: a part that scenes hold, move or grasp [m]; a seventh makes it soft,
+    stiffness / E [1/m^2]. Coordinates: z up, the box centred over the origin, on z = 0; inf is allowed."""
     seed: int = 0
-    """Seed of every random choice of the build."""
+    """Seed of what the build draws."""
     toy: Annotated[ObjectOptions, own_group()] = dataclasses.field(default_factory=ObjectOptions)
     """Your own object; what is left out is as the task, the policy's run or the file has it."""
 
@@ -188,12 +188,11 @@ class BodyCut(_Asset):
     """
 
     plane: tuple[str, ...] = ()
-    """x,y,z,nx,ny,nz: a point [m] and the normal of a plane. Coordinates: z up, bounding box centred over the origin,
-    standing on z = 0. Several, after each other, cut one after the other."""
+    """x,y,z,nx,ny,nz: a point [m] and the normal of a plane, placed as a region is. Several cut in turn."""
     inside: tuple[float, float, float] | None = None
     """Colour 0..1 of the faces that are opened; the mean of the splats if omitted."""
     out: Annotated[Path | None, short_name("-o")] = None
-    """Body files to write: FILE-1.npz, FILE-2.npz, ... for FILE.npz, which stands beside the file if omitted."""
+    """Body files to write: FILE-1.npz, FILE-2.npz, ... for FILE.npz; beside the file if omitted."""
 
     def run(self) -> int:
         """Cut, write, say what happened."""
@@ -262,6 +261,7 @@ def _examined(options: _Asset) -> tuple[SoftObject, BodyReport]:
         given = same_fields(options, BuildOptions)
         given |= {"mode_count": options.modes, "kernel_count": options.kernels, "cubature_count": options.points}
         given |= {"function_count": options.functions, "poissons_ratio": options.poissons_ratio or None}
+        given["add_kernels"] = tuple(_kernel(text) for text in options.kernels_at)
         if options.rank_tolerance is None:
             given["rank_tolerance"] = RANK_TOLERANCE
         counts: dict[str, int | None] = {"splat_count": options.splats}
@@ -292,6 +292,12 @@ def _print_report(report: BodyReport, *, measures: bool) -> None:
             print(f"{measure.name:44} {measure.value:.4g} {measure.unit}".rstrip())
     for finding in report.findings:
         print(finding_line(finding, sys.stdout))
+
+
+def _kernel(text: str) -> tuple[list[float], float]:
+    """Return the place and the radius of X,Y,Z,RADIUS."""
+    *place, radius = named_numbers("kernels-at", f"at={text}", (4,))[1]
+    return place, radius
 
 
 def _region(text: str) -> Region:

@@ -19,7 +19,7 @@ from softmode.cli.new import New
 from softmode.cli.objects import ObjectsExport, ObjectsList, ObjectsShow
 from softmode.cli.plain import plain_output
 from softmode.cli.play import Play
-from softmode.cli.radiance import RadianceBake, RadianceInfo
+from softmode.cli.radiance import RadianceBake, RadianceInfo, RadianceSample
 from softmode.cli.record import Record
 from softmode.cli.robots import Robots
 from softmode.cli.splat import SplatConvert, SplatFromMesh, SplatInfo, SplatShow
@@ -48,7 +48,10 @@ COMMANDS: Commands = {
         "Draw, make, inspect and convert splat files.",
         {"show": SplatShow, "from-mesh": SplatFromMesh, "info": SplatInfo, "convert": SplatConvert},
     ),
-    "radiance": ("Inspect fields, bake them to splats.", {"info": RadianceInfo, "bake": RadianceBake}),
+    "radiance": (
+        "Inspect fields, bake them to splats, sample trained networks.",
+        {"info": RadianceInfo, "bake": RadianceBake, "sample": RadianceSample},
+    ),
     "body": (
         "Build, draw, check and cut the bodies of soft objects.",
         {"build": BodyBuild, "show": BodyShow, "check": BodyCheck, "cut": BodyCut},

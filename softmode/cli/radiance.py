@@ -1,4 +1,4 @@
-"""The commands ``softmode radiance info`` and ``bake``."""
+"""The commands ``softmode radiance info``, ``bake`` and ``sample``."""
 
 from __future__ import annotations
 
@@ -17,28 +17,38 @@ class RadianceInfo:
     """
 
     file: Path
-    """The field: .npz, also Plenoxels', or .nvdb."""
+    """The field: .npz, also Plenoxels' and PlenOctree's, or .nvdb."""
 
     def run(self) -> int:
-        """Print nodes, degree, box and densities."""
+        """Print nodes, degree, box, densities and what solid they show."""
         import numpy as np
 
+        from softmode.deformables.quadrature.quadrature_density import FOGGY, quadrature_from_density
         from softmode.radiance.formats import read_radiance
 
         with quiet_warp():
             field = read_radiance(self.file)
         low, high = field.bounds
-        deciles = np.quantile(field.density[field.occupied].astype(float), [0.1, 0.5, 0.9])
+        density = field.density[field.occupied if field.occupied.any() else field.density > 0.0].astype(float)
+        deciles = np.quantile(density, [0.1, 0.5, 0.9])
+        box = field.bounds + np.array([[-1.0], [1.0]]) * field.spacing
+        solid = quadrature_from_density(field.densities, box, surface_count=16)
+        fog, unit = float(solid.report["fog"]), "not known" if field.metres is None else f"{field.metres:.4g} m"
 
         def row(values: object) -> str:
             return "  ".join(f"{value:.4g}" for value in np.ravel(np.asarray(values)))
 
         print(f"nodes       {' x '.join(map(str, field.shape))}, {field.occupied.mean():.0%} not empty")
         print(f"sh degree   {field.sh_degree}")
+        print(f"unit        {unit}")
         print(f"spacing     {row(np.linalg.norm(field.axes, axis=0))}")
         print(f"not empty   {row(low)}  to  {row(high)}")
         print(f"size        {row(high - low)}")
         print(f"densities   {row(deciles)}  per unit of length (10, 50, 90 % of what is not empty)")
+        print(f"opacities   {row(-np.expm1(-deciles * field.spacing))}  of a voxel, likewise")
+        print(f"solid       {solid.volume:.4g} units of length cubed; half the level of its surface adds {fog:.0%}")
+        if fog > FOGGY:
+            print("            this is fog (walls: 0 to 11 %): the solid is doubtful, and cavities may be full")
         return 0
 
 
@@ -98,4 +108,52 @@ class RadianceBake:
             f"{fit.history[0][1]:.1f} dB covered, {fit.psnr:.1f} dB fitted"
         )
         print(f"wrote {fit.splats.count} splats of degree {fit.splats.sh_degree} to {out}")
+        return 0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RadianceSample:
+    """Sample a field in Python, such as a trained network, onto a grid.
+
+    Example: softmode radiance sample my_nerf:field toy.npz
+    """
+
+    function: str
+    """MODULE:FUNCTION; it maps points (N, 3) to densities (N,) and colours 0..1 (N, 3), see from_function. The module
+    is imported, from the working folder first: its code runs."""
+    out: Path
+    """The field to write (.npz)."""
+    bounds: tuple[float, float, float, float, float, float] | None = None
+    """Box x0 y0 z0 x1 y1 z1 around the object; looked for around the origin if omitted."""
+    resolution: int | None = None
+    """Nodes along the longest edge; as many as its surface needs if omitted, 64 to 256."""
+    metres: float | None = None
+    """Metres of a unit of length, if they are known."""
+
+    def run(self) -> int:
+        """Import, look for the object, sample, write; return the exit code."""
+        import sys
+        from importlib import import_module
+
+        import numpy as np
+
+        from softmode.errors import ConfigError
+        from softmode.radiance.formats import write_radiance
+        from softmode.radiance.sample import sampled_field
+
+        module, _, name = self.function.partition(":")
+        sys.path.insert(0, str(Path.cwd()))
+        try:
+            field = getattr(import_module(module), name)
+        except (ImportError, AttributeError, ValueError) as error:
+            hint = "give MODULE:FUNCTION, of a module in the working folder or installed"
+            raise ConfigError(f"{self.function}: {error}", hint=hint) from error
+        finally:
+            sys.path.pop(0)
+        box = None if self.bounds is None else np.reshape(self.bounds, (2, 3))
+        with quiet_warp():
+            found = sampled_field(field, box, self.resolution, name=self.function, metres=self.metres)
+            write_radiance(self.out, found)
+        low, high = (" ".join(f"{x:.4g}" for x in corner) for corner in found.bounds)
+        print(f"wrote {' x '.join(map(str, found.shape))} nodes to {self.out}; the object fills {low} to {high}")
         return 0

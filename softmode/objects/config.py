@@ -81,7 +81,7 @@ class ObjectConfig:
     is, with its own size, pose, surface samples, regions and splats."""
     size: float | None = None
     """Longest edge of the bounding box of plush, preset, splat file, mesh or field, upright [m]; None for a preset's
-    own, else 0.08. The gripper opens 0.09 m."""
+    own and that of a field which says its metres, else 0.08. The gripper opens 0.09 m."""
     colors: tuple[Color, Color] | None = None
     """Two colours, 0..1, of a shape or mesh, as a checker pattern; None for orange and cream, or the mesh's own."""
     splat_count: int | None = None
@@ -189,10 +189,10 @@ class ObjectConfig:
 
     @property
     def longest_edge(self) -> float | None:
-        """Longest edge that it is brought to [m]; None for what has its own: shapes, bodies, most presets."""
+        """Longest edge that it is brought to [m]; None for what may have its own: shapes, bodies, presets, fields."""
         if self.body is not None or self.extents is not None:
             return None
-        return self.size if self.preset is not None else self.size or SIZE
+        return self.size if self.preset is not None or self.radiance is not None else self.size or SIZE
 
     @property
     def material(self) -> Material | None:

@@ -193,6 +193,9 @@ def dressed(body: ReducedBody, config: ObjectConfig, source: ObjectSource, mater
     if config.preset is not None:
         told["material"] = json.dumps(find_preset(config.preset).properties)
     factor, field = float(np.cbrt(np.linalg.det(turn))), source.radiance
+    if source.field_pose is not None:
+        laid = np.block([[turn, -body.offset[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]]) @ source.field_pose
+        told["field_pose"] = json.dumps(laid.tolist())
     return SoftObject(
         body=replace(body, provenance={**body.provenance, **told}),
         splats=splats,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import dataclass
 from functools import cached_property
@@ -87,6 +88,16 @@ class SoftObject:
         except GraspError as error:
             return (*found, Finding(severity="warning", name="gripper", what=error.message, remedy=error.hint))
         return found
+
+    @property
+    def field_pose(self) -> Array | None:
+        """What takes places in the frame of the field's file into the body frame, a scale times a rotation, and a move.
+
+        Shape (4, 4); None if it is not made of a field. So a camera of the pictures that the field was trained on sees
+        the body.
+        """
+        told = self.body.provenance.get("field_pose")
+        return None if told is None else np.array(json.loads(str(told)))
 
     @property
     def size_asked(self) -> float | None:

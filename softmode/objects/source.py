@@ -19,7 +19,7 @@ from softmode.deformables.reduction.cache import cached
 from softmode.errors import AssetError, ConfigError
 from softmode.files import read_archive, write_archive
 from softmode.foreign import tokens
-from softmode.objects.config import ObjectConfig
+from softmode.objects.config import SIZE, ObjectConfig
 from softmode.objects.mesh_file import read_mesh
 from softmode.objects.parts import choose_part
 from softmode.objects.pose import seat_of
@@ -69,6 +69,8 @@ class ObjectSource:
     """Longest edge to which its solid is scaled, since a fill may hold more or less than its splats [m]."""
     radiance: RadianceGrid | None = None
     """Its radiance field, where the splats are."""
+    field_pose: np.ndarray | None = None
+    """What takes places of that field's file there, shape (4, 4)."""
     capture: dict[str, str | int | float] = field(default_factory=dict)
     """What was found in its file beside it, for the report."""
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -87,15 +89,18 @@ def object_source(config: ObjectConfig) -> ObjectSource:
     return _READERS[config.kind](config, getattr(config, config.kind, config.extents))
 
 
-def upright_field(config: ObjectConfig, given: str | Path | RadianceGrid) -> RadianceGrid:
-    """Return a field upright, cropped, standing on z = 0 around the origin, at the wanted size."""
+def upright_field(config: ObjectConfig, given: str | Path | RadianceGrid) -> tuple[RadianceGrid, np.ndarray]:
+    """Return a field upright, cropped, standing on z = 0 around the origin, at its size, and what took it there."""
     grid = given if isinstance(given, RadianceGrid) else read_radiance(given)
-    grid = grid.oriented(config.up or "+z")
+    up = config.up or "+z"
+    grid = grid.oriented(up)
     if config.crop is not None:
         grid = grid.cropped(config.crop[:3], config.crop[3:])
     extent = float(np.ptp(grid.bounds, axis=0).max())
-    scale = (config.longest_edge or extent) / extent
-    return grid.transformed(translation=-scale * seat_of(grid.bounds), scale=scale)
+    scale = config.size / extent if config.size is not None else grid.metres or SIZE / extent
+    move = -scale * seat_of(grid.bounds)
+    pose = np.block([[scale * up_rotation(up), move[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
+    return grid.transformed(translation=move, scale=scale), pose
 
 
 def baked_splats(key: tuple[object, ...], grid: RadianceGrid, count: int) -> Splats:
@@ -152,13 +157,14 @@ def _mesh_source(config: ObjectConfig, given: str | Path | ColoredMesh, splat_co
 
 def _field_source(config: ObjectConfig, given: str | Path | RadianceGrid) -> ObjectSource:
     """Read a radiance field, and bake it into splats."""
-    grid, splat_count = upright_field(config, given), config.splat_count or SPLATS
+    (grid, pose), splat_count = upright_field(config, given), config.splat_count or SPLATS
     key = ("radiance", *(getattr(grid, name) for name in ("density", "sh", "origin", "axes")))
     baked = baked_splats((*key, splat_count), grid, splat_count)
     box = grid.bounds + np.array([[-1.0], [1.0]]) * grid.spacing
     options = {} if config.resolution is None else {"resolution": config.resolution}
     solid = partial(quadrature_from_density, grid.densities, box, surface_count=config.surface_count, **options)
-    return ObjectSource(baked, solid, grid.name, (*key, config.resolution), baked.count, config.longest_edge, grid)
+    fitted = config.size if config.size is not None or grid.metres else SIZE
+    return ObjectSource(baked, solid, grid.name, ("fog", *key, config.resolution), baked.count, fitted, grid, pose)
 
 
 def _shape_source(shape: Primitive, config: ObjectConfig, extents: Extents) -> ObjectSource:
@@ -176,7 +182,8 @@ def _splat_source(config: ObjectConfig, given: str | Path | Splats | None) -> Ob
     solid = partial(quadrature_from_splats, *arrays, surface_count=config.surface_count, resolution=config.resolution)
     key = ("splats, shown", *arrays, config.resolution)
     count = int(capture["asset_splats"])
-    return ObjectSource(splats, solid, name, key, count, config.longest_edge, None, capture, told.offset, told.notes)
+    size, offset, notes = config.longest_edge, told.offset, told.notes
+    return ObjectSource(splats, solid, name, key, count, size, capture=capture, offset=offset, notes=notes)
 
 
 def _body_source(config: ObjectConfig, given: str | Path) -> ObjectSource:

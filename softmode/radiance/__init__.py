@@ -17,5 +17,6 @@ if TYPE_CHECKING:
     from softmode.radiance.march import MarchOptions as MarchOptions
     from softmode.radiance.march import RadianceMarch as RadianceMarch
     from softmode.radiance.march import render_radiance as render_radiance
+    from softmode.radiance.sample import sampled_field as sampled_field
 
 __getattr__, __dir__ = lazy_names(__name__)

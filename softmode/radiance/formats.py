@@ -1,4 +1,4 @@
-"""Files of radiance fields: .npz (ours, plain ones, Plenoxels') and NanoVDB."""
+"""Files of radiance fields: .npz (ours, plain ones, of Plenoxels and PlenOctree) and NanoVDB."""
 
 from __future__ import annotations
 
@@ -16,6 +16,9 @@ from softmode.files import array_names, damage_errors, read_arrays, read_file, w
 from softmode.radiance.grid import RadianceGrid, check_size, sh_of_colors
 from softmode.radiance.nanovdb import checked
 from softmode.radiance.nanovdb_kernels import read_values
+from softmode.radiance.plenoctree import NAMES as PLENOCTREE
+from softmode.radiance.plenoctree import field_of_plenoctree
+from softmode.splats.formats.others import refuse_others
 
 SUFFIXES = (".npz", ".nvdb")
 """What fields are read from."""
@@ -23,7 +26,7 @@ _OURS = ("density", "sh", "origin", "axes")
 _PLAIN = ("density", "bounds")
 _PLENOXELS = ("links", "density_data", "sh_data", "radius", "center")
 _HINT = "export it again"
-_FREE, _DENSE_FREE = 48 << 20, 256 << 20
+_FREE, _DENSE_FREE = 128 << 20, 256 << 20
 
 
 def is_radiance(path: str | os.PathLike[str]) -> bool:
@@ -38,21 +41,23 @@ def is_radiance(path: str | os.PathLike[str]) -> bool:
     if file.suffix.lower() != ".npz":
         return False
     names = array_names(file, hint=_HINT)
-    return names >= set(_PLAIN[:1]) or names >= set(_PLENOXELS[:3])
+    return any(names >= set(some) for some in (_PLAIN[:1], _PLENOXELS[:3], PLENOCTREE))
 
 
 def read_radiance(path: str | os.PathLike[str]) -> RadianceGrid:
     """Read a radiance field.
 
     `.npz`: `density` [1/m] with `bounds`, corners of first and last node [m] (2, 3), and colours `rgb` (..., 3) or
-    coefficients `sh` (..., K, 3); or what `write_radiance` wrote; or a checkpoint of Plenoxels (Fridovich-Keil et al.
-    2022), of which background and learned bases are not read. `.nvdb`: the first grid of numbers is the density, one of
-    vectors the colour 0..1, if there is one, else it is grey.
+    coefficients `sh` (..., K, 3), and `metres`, those of a unit of length, if they are known; or what `write_radiance`
+    wrote; or a checkpoint of Plenoxels (Fridovich-Keil et al. 2022), of which background and learned bases are not
+    read; or a PlenOctree, see `field_of_plenoctree`. `.nvdb`: the first grid of numbers is the density, one of vectors
+    the colour 0..1, if there is one, else it is grey.
 
     Raises:
         AssetError: If the file is missing, damaged, too large, of another kind, or holds no field.
     """
     file = Path(path)
+    refuse_others(file)
     if file.suffix.lower() not in SUFFIXES:
         raise AssetError(f"radiance field {file}: cannot read {file.suffix or 'no suffix'!r}",
                          hint=f"readable are {', '.join(SUFFIXES)}")  # fmt: skip
@@ -62,20 +67,24 @@ def read_radiance(path: str | os.PathLike[str]) -> RadianceGrid:
 
 def _read_npz(file: Path) -> RadianceGrid:
     """Return the field of an .npz."""
-    names = {*_OURS, *_PLAIN, *_PLENOXELS, "rgb", "basis_type"}
+    names = {*_OURS, *_PLAIN, *_PLENOXELS, *PLENOCTREE, "rgb", "basis_type", "metres"}
     arrays = read_arrays(file, names, what="radiance field", hint=_HINT, free=_FREE)
     name = file.name
+    metres = float(arrays["metres"]) if "metres" in arrays else None
     if set(arrays) >= set(_OURS):
-        return RadianceGrid(**{key: arrays[key] for key in _OURS}, name=name)
+        return RadianceGrid(**{key: arrays[key] for key in _OURS}, name=name, metres=metres)
     if set(arrays) >= set(_PLENOXELS):
         return _plenoxels(arrays, name)
+    if set(arrays) >= set(PLENOCTREE):
+        return field_of_plenoctree(arrays, name, _HINT)
     if not set(arrays) >= set(_PLAIN) or not ({"sh", "rgb"} & set(arrays)):
         raise AssetError(
             f"radiance field {name}: holds {sorted(arrays) or 'none of the known keys'}",
-            hint="give density, bounds and rgb or sh; or links, density_data, sh_data, radius and center of Plenoxels",
+            hint="give density, bounds and rgb or sh; or links, density_data, sh_data, radius and center of Plenoxels;"
+            " or child, data, data_format, invradius3 and offset of a PlenOctree",
         )
     sh = arrays["sh"] if "sh" in arrays else _colors(arrays["rgb"], name)
-    return RadianceGrid.from_bounds(arrays["density"], sh, arrays["bounds"], name=name)
+    return RadianceGrid.from_bounds(arrays["density"], sh, arrays["bounds"], name=name, metres=metres)
 
 
 def write_radiance(path: str | os.PathLike[str], field: RadianceGrid) -> None:
@@ -87,7 +96,8 @@ def write_radiance(path: str | os.PathLike[str], field: RadianceGrid) -> None:
     """
     if Path(path).suffix.lower() != ".npz":
         raise AssetError(f"radiance field {path}: cannot write this kind", hint="name it like toy.npz")
-    write_compressed(path, {name: getattr(field, name) for name in _OURS}, "radiance field")
+    unit = {} if field.metres is None else {"metres": np.array(field.metres)}
+    write_compressed(path, {name: getattr(field, name) for name in _OURS} | unit, "radiance field")
 
 
 def _colors(rgb: NDArray[Any], name: str) -> NDArray[np.float16]:

@@ -49,6 +49,8 @@ class RadianceGrid:
     """Steps between nodes as columns [m], a rotation times positive lengths, shape (3, 3)."""
     name: str = "radiance field"
     """Where it comes from; used in messages."""
+    metres: float | None = None
+    """Metres of one unit of its lengths, if its file says so; then an object of it has its size. None if not known."""
 
     def __post_init__(self) -> None:
         """Convert, validate and freeze the arrays."""
@@ -69,6 +71,8 @@ class RadianceGrid:
         if density.min() == density.max():
             hint = "give a field with empty space around an object"
             raise AssetError(f"{self.name}: density is {density.max():.3g} 1/m everywhere", hint=hint)
+        if self.metres is not None and not (np.isfinite(self.metres) and self.metres > 0.0):
+            raise AssetError(f"{self.name}: a unit of {self.metres} metres", hint="give a positive number, or none")
         origin, axes = np.array(self.origin, dtype=np.float64), np.array(self.axes, dtype=np.float64)
         lengths = np.linalg.norm(axes, axis=0) if axes.shape == (3, 3) else np.zeros(3)
         proper = axes.shape == (3, 3) and origin.shape == (3,) and np.isfinite([*axes.ravel(), *origin]).all()
@@ -97,13 +101,19 @@ class RadianceGrid:
 
     @classmethod
     def from_bounds(
-        cls, density: ArrayLike, sh: ArrayLike, bounds: ArrayLike, *, name: str = "radiance field"
+        cls,
+        density: ArrayLike,
+        sh: ArrayLike,
+        bounds: ArrayLike,
+        *,
+        name: str = "radiance field",
+        metres: float | None = None,
     ) -> RadianceGrid:
         """Return the field whose first and last node lie at the corners of a box [m], shape (2, 3)."""
         box, shape = _corners(name, bounds), np.shape(density)
         _require_nodes(name, shape)
         return cls(density=np.asarray(density), sh=np.asarray(sh), origin=box[0],
-                   axes=np.diag((box[1] - box[0]) / (np.array(shape) - 1)), name=name)  # fmt: skip
+                   axes=np.diag((box[1] - box[0]) / (np.array(shape) - 1)), name=name, metres=metres)  # fmt: skip
 
     @classmethod
     def from_function(
@@ -261,6 +271,7 @@ class RadianceGrid:
         return replace(
             self,
             density=self._float_density / np.float32(scale),
+            metres=None if self.metres is None else self.metres / scale,
             origin=scale * matrix @ self.origin + np.asarray(translation, dtype=np.float64),
             axes=scale * matrix @ self.axes,
         )

@@ -202,6 +202,9 @@ class SplatScene:
     def push(self, index: int, force: ArrayLike) -> None:
         """Let forces act on the surface samples of an object, such as those of wind, until others are given.
 
+        They keep their directions while the object turns, so that forces which press it from two sides turn it round
+        and pull it: squeeze between fixtures, or by :attr:`grips`.
+
         Args:
             index: Which object.
             force: One for each sample [N], shape (surface_count, 3), or one for all.

@@ -34,6 +34,10 @@ if TYPE_CHECKING:
     from softmode.splats.plush import plush_signed_distance as plush_signed_distance
     from softmode.splats.point_cloud import splats_from_points as splats_from_points
     from softmode.splats.raster.pinhole import PinholeCamera as PinholeCamera
+    from softmode.splats.raster.posed_pictures import Lens as Lens
+    from softmode.splats.raster.posed_pictures import PosedPicture as PosedPicture
+    from softmode.splats.raster.posed_pictures import read_transforms as read_transforms
+    from softmode.splats.raster.posed_pictures import write_transforms as write_transforms
     from softmode.splats.raster.rasterizer import RasterizerOptions as RasterizerOptions
     from softmode.splats.raster.rasterizer import SplatArrays as SplatArrays
     from softmode.splats.raster.rasterizer import SplatRasterizer as SplatRasterizer

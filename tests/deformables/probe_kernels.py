@@ -145,10 +145,12 @@ def evaluate_stick(
     x: wp.array[wp.float64],
     limit: wp.float64,
     stiffness: wp.float64,
+    deep: wp.float64,
+    depth: wp.float64,
     # Out:
     out: wp.array[wp.vec3d],
 ):
     """Evaluate friction with memory: energy, force over slip, curvature along the slip."""
     i = wp.tid()
-    energy, secant, tangent = contact.stick_potential(x[i], limit, stiffness)
+    energy, secant, tangent = contact.stick_potential(x[i], limit, stiffness, deep, depth)
     out[i] = wp.vec3d(energy, secant, tangent)

@@ -212,7 +212,8 @@ def test_pins_of_a_prescribed_link_stay_on_their_circle():
     solver.begin(state, scene.control, scene.dt)
     solver.detect(state, scene.control, scene.dt, prescribed=True)
     count = solver.view.instances.pin_count.numpy()[0]
-    points = solver.view.basis.row_point.numpy()[-count:]
+    rows = solver.view.constraints.row.numpy()[0, :count]
+    points = solver.view.basis.row_point.numpy()[rows]
     target = points - solver.view.constraints.offset.numpy()[0, :count]  # the body is where it was put: x_n = X
     circle = link + (points - link) @ rotation((0, 1, 0), turn).T
     np.testing.assert_allclose(target, circle, atol=1e-6)

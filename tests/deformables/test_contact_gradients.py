@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 import warp as wp
 
+from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.gradients.adjoint import AdjointOptions, AdjointReduced
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from softmode.errors import ConfigError, SolverDiverged
-from tests.bodies import cube
+from tests.bodies import cube, smooth_ball
 from tests.scenes import GRAVITY, Scene
 
 EXACT = SolverReducedOptions(tolerance=1.0e-12, force_tolerance=1.0e-12, iteration_max=100, friction_lag=100)
@@ -34,6 +35,7 @@ class Landing:
         turntable: Whether it lands on a box that turns, instead of on the ground.
         height: Of its centre at the start [m].
         stiffness: Contact stiffness per area [Pa/m]; None for the one that follows the body.
+        body: What lands, 5 cm from its centre; None for the cube.
     """
 
     def __init__(
@@ -44,10 +46,11 @@ class Landing:
         turntable: bool = False,
         height: float = 0.0505,
         stiffness: float | None = None,
+        body: ReducedBody | None = None,
     ) -> None:
         """Build the scene and random weights of the loss."""
-        body, worlds = cube(), len(youngs_modulus)
-        self.friction = friction
+        self.friction, self.least = friction, 10 if body is None else 3
+        body, worlds = body or cube(), len(youngs_modulus)
 
         def populate(world: newton.ModelBuilder) -> None:
             material = Material(viscosity=0.005, density=500.0, friction=friction)
@@ -104,7 +107,7 @@ class Landing:
     def gradients(self) -> dict[str, np.ndarray]:
         """Return the gradients of the unchanged run, which must touch something."""
         self.run()
-        assert self.scene.reduced.view.constraints.count.numpy().min() > 10
+        assert self.scene.reduced.view.constraints.count.numpy().min() > self.least
         return self.adjoint.backward(loss_q=self.weight).numpy()
 
     def difference(self, name: str, relative: float) -> float:
@@ -136,13 +139,15 @@ def test_frictionless_contact(youngs_modulus: float) -> None:
     """DL/d(E, nu, rho, scale, v_0) within 1e-3 of differences at the default contact stiffness.
 
     It follows the mass for E up to 1e5 here, and E and nu for the two others. Over steps of 1e-3 a contact may come or
-    go between the two runs.
+    go between the two runs. So the step of v_0 is smaller: at 1e4 Pa the difference itself is off by 1e-3 at 3e-4, by
+    4e-4 at 1.5e-4 and by 1e-6 at 1e-5.
     """
     case = stiff_landing() if youngs_modulus == 2.0e6 else Landing(youngs_modulus)
     gradients = case.gradients()
     for name in ("youngs_modulus", "poissons_ratio", "density", "scale", "qd"):
         found = case.gradient(gradients, name)
-        assert found == pytest.approx(case.difference(name, 3.0e-4), rel=1.0e-3), name
+        step = 1.0e-4 if name == "qd" else 3.0e-4
+        assert found == pytest.approx(case.difference(name, step), rel=1.0e-3), name
     assert gradients["grad_residual"].max() < 1.0e-10
 
 
@@ -182,11 +187,12 @@ def test_scale_of_a_body_that_is_placed_anew() -> None:
 def test_frictional_contact(options: SolverReducedOptions) -> None:
     """DL/d(E, nu, rho, mu, v_0, q_0) within 1e-2 of differences, samples sticking, sliding and leaving.
 
-    The steps are small: the force has a kink where a sample begins to slide, and a difference may cross it.
+    The steps are small: the force has a kink where a sample begins to slide, and a difference may cross it. By friction
+    it is off by 1.5e-2 at 1e-3, by 4e-5 at 5e-4 and by 2e-6 at 3e-4.
     """
     case = Landing(1.0e5, friction=0.8, options=options)
     gradients = case.gradients()
-    steps = {"youngs_modulus": 1e-3, "poissons_ratio": 1e-4, "density": 1e-3, "friction": 1e-3, "qd": 1e-5, "q": 1e-5}
+    steps = {"youngs_modulus": 1e-3, "poissons_ratio": 1e-4, "density": 1e-3, "friction": 3e-4, "qd": 1e-5, "q": 1e-5}
     for name, relative in steps.items():
         assert case.gradient(gradients, name) == pytest.approx(case.difference(name, relative), rel=1.0e-2), name
     assert gradients["grad_residual"].max() < 1.0e-10
@@ -196,6 +202,25 @@ def test_frictional_contact(options: SolverReducedOptions) -> None:
         force, slip = (getattr(constraints, name).numpy()[0, :count] for name in ("force", "slip"))
         sticks = np.isclose(np.linalg.norm(force[:, :2], axis=1), force[:, 2] * 0.8, rtol=1e-3)
         assert slip.any() and 0 < sticks.sum() < count
+
+
+def test_ball_that_rolls() -> None:
+    """A ball lands and rolls: its cells' ranges, centres of pressure and neighbourhoods follow the state in every step.
+
+    Held constant they give -0.26 of dL/dE and 1.6 of dL/drho. Within 1e-2 of differences.
+    """
+    case = Landing(1.0e5, friction=0.8, body=smooth_ball(8, 400))
+    gradients = case.gradients()
+    steps = {
+        "youngs_modulus": 1e-3,
+        "poissons_ratio": 1e-4,
+        "density": 1e-3,
+        "scale": 1e-4,
+        "friction": 1e-3,
+        "qd": 1e-5,
+    }
+    for name, relative in steps.items():
+        assert case.gradient(gradients, name) == pytest.approx(case.difference(name, relative), rel=1.0e-2), name
 
 
 def test_friction_on_a_turntable() -> None:

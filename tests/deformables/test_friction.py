@@ -25,24 +25,30 @@ ShapeConfig = newton.ModelBuilder.ShapeConfig
 # -- the potential -----------------------------------------------------------------------------------------------------
 
 
-def test_stick_potential():
-    """A spring up to the limit, linear beyond; slope = secant * y; a continuous force, never above the limit."""
+@pytest.mark.parametrize("depth", [1.0, 1.0e-3], ids=["soft", "used up"])
+def test_stick_potential(depth):
+    """A spring up to the limit, linear beyond; slope = secant * y; a continuous force, never above the limit.
+
+    Where the dent along the surface is used up, a tenth of ``depth``, the spring is five times as stiff.
+    """
     limit, stiffness, step = 0.3, 2.0e3, 1.0e-9
+    spring = (stiffness, 5.0 * stiffness, depth)
     y = np.linspace(step, 4.0 * limit / stiffness, 400)
 
     def evaluate(values, limit=limit):
         with wp.ScopedDevice("cpu"):
             out = wp.zeros(len(values), dtype=wp.vec3d)
-            inputs = [wp.array(values, dtype=wp.float64), wp.float64(limit), wp.float64(stiffness)]
+            inputs = [wp.array(values, dtype=wp.float64), *map(wp.float64, (limit, *spring))]
             wp.launch(evaluate_stick, dim=len(values), inputs=inputs, outputs=[out])
         return out.numpy()
 
     value = evaluate(y)
-    np.testing.assert_allclose(value[:, 0], reference.stick_potential(y, limit, stiffness), rtol=1e-12)
+    np.testing.assert_allclose(value[:, 0], reference.stick_potential(y, limit, *spring), rtol=1e-12)
     slope = (evaluate(y + step)[:, 0] - evaluate(y - step)[:, 0]) / (2 * step)
     np.testing.assert_allclose(value[:, 1] * y, slope, atol=1e-5 * limit)
     assert (value[:, 1] * y).max() == pytest.approx(limit)
-    np.testing.assert_array_equal(value[:, 2], np.where(y * stiffness <= limit, stiffness, 0.0))
+    tangent = np.where(y <= 0.1 * depth, stiffness, 5.0 * stiffness)
+    np.testing.assert_array_equal(value[:, 2], np.where(value[:, 1] * y < (1.0 - 1e-12) * limit, tangent, 0.0))
     np.testing.assert_array_equal(evaluate(np.array([0.0, step]), limit=0.0), 0.0)
 
 
@@ -154,7 +160,11 @@ def test_carried_on_a_free_body():
 
 
 def test_force_stays_in_the_cone():
-    """|f_t| <= mu f_n in every contact of every step, sticking and sliding; and it opposes the slip."""
+    """|f_t| <= mu f_n in every contact of every step, sticking and sliding; and it opposes the slip.
+
+    The f_n of friction is that of the contact to rounding, but in the first step, which needs ten iterations: it is
+    frozen after eight.
+    """
     scene, along = incline(1.5)
     seen = 0
     for _ in range(60):
@@ -166,8 +176,8 @@ def test_force_stays_in_the_cone():
         tangential = np.linalg.norm(f - normal[:, None] * n, axis=1)
         lagged = entries.normal_force.numpy()[0, :count]
         assert (tangential <= MU * lagged * (1 + 1e-9)).all()
-        # it follows the contact for eight iterations, in most steps to the end
-        np.testing.assert_allclose(lagged, normal, atol=1e-4 * scene.mass() * GRAVITY)
+        frozen = scene.reduced.iteration.numpy()[0] > SolverReducedOptions().friction_lag
+        np.testing.assert_allclose(lagged, normal, atol=(2e-4 if frozen else 1e-6) * scene.mass() * GRAVITY)
         assert (f @ along <= 1e-9).all()
         seen += int((normal > 0).sum())
     assert seen > 100
@@ -269,7 +279,7 @@ def test_stick_is_the_return_map():
     count = int(entries.count.numpy()[0])
     f, k = entries.force.numpy()[0, :count], entries.stick.numpy()[0, :count]
     shapes, points = memory(scene)
-    rows = entries.row.numpy()[0, :count]
+    rows = entries.partner_row.numpy()[0, :count]
     held = (f**2).sum(axis=1) > 0.0
     world = points[rows, 0] @ rotation((0, 1, 0), np.arctan(1.5 * MU)).T
     n = entries.normal.numpy()[0, :count]

@@ -165,11 +165,11 @@ def test_plane_is_exact():
 
 
 def test_gap_of_spheres_is_of_second_order():
-    """Between spheres gap = |x - c| - R + O(spacing^2 / R)."""
+    """Between spheres gap = |x - c| - R + O(spacing^2 / R), and a small share of it: surfaces bend off their planes."""
     errors, spacings = [], []
     for count in (150, 600):
         body = ball(0.03, count)
-        scene = two(body, body, (0.0, 0.0, 0.06), rotation=rotation((1, 2, 0), 0.7))
+        scene = two(body, body, (0.0, 0.0, 0.059), rotation=rotation((1, 2, 0), 0.7))
         rows = [row for row in found(scene) if abs(row[3]) < 2e-3]
         assert len(rows) > 2
         centres = [scene.centre(i) for i in range(2)]
@@ -178,7 +178,7 @@ def test_gap_of_spheres_is_of_second_order():
         error = [gap - (np.linalg.norm(surfaces[i].points[s] - centres[j]) - radius) for i, s, j, gap, *_ in rows]
         errors.append(np.sqrt(np.mean(np.square(error))))
         spacings.append(surfaces[0].spacing)
-        assert errors[-1] < 0.5 * spacings[-1] ** 2 / radius
+        assert errors[-1] < 0.02 * spacings[-1] ** 2 / radius
     assert np.log(errors[0] / errors[1]) / np.log(spacings[0] / spacings[1]) > 1.6
 
 

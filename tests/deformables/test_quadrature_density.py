@@ -64,6 +64,19 @@ def test_soft_density():
     np.testing.assert_allclose(large.points, 128.0 * small.points, atol=1e-6)
 
 
+def test_fog():
+    """A ball of fog with a thicker cap has the volume of the ball, and the report says that it is fog; walls are not.
+
+    Half of the 95th percentile is the cap alone.
+    """
+    near, volume = lambda x: np.linalg.norm(x, axis=1) < 0.04, 4.0 / 3.0 * np.pi * 0.04**3
+    found = quadrature_from_density(lambda x: np.where(near(x), np.where(x[:, 2] > 0.02, 400.0, 60.0), 0.0), BOX, **FEW)
+    assert found.volume == pytest.approx(volume, rel=0.05)
+    assert found.report["fog"] > 1.0 and found.report["level_share"] < 0.5
+    walls = quadrature_from_density(opaque(near), BOX, **FEW)
+    assert walls.report["fog"] < 0.12 and walls.report["level_share"] == 0.5
+
+
 def test_voids_and_parts():
     """A hollow shell is filled, a floater is left out, and the report says so."""
 

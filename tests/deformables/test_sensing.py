@@ -131,10 +131,11 @@ def test_grasp():
     entries = scene.reduced.view.constraints
     count = entries.count.numpy()[0]
     body, q = scene.body(), scene.next_state.softmode.q.numpy()  # the start of the last step
-    row = entries.row.numpy()[0, :count]
+    row, basis = entries.row.numpy()[0, :count], scene.reduced.view.basis
+    values = basis.row.numpy().reshape(len(basis.row), -1)[row, : body.function_count]
     rows = {
         "body": entries.body.numpy()[0, :count],
-        "point": body.surface.points[row] + body.surface.basis[row] @ q,
+        "point": basis.row_point.numpy()[row] + values @ q,
         "normal": entries.normal.numpy()[0, :count],
         "force": entries.force.numpy()[0, :count],
     }

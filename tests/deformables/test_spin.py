@@ -133,6 +133,7 @@ def test_tumbling_bounce(modulus, dt):
 
     scene = Scene(populate, [brick()], gravity=(0.0, 0.0, -GRAVITY), ground=0.5, dt=dt, options=options)
     start, constraints, pressed = energy(scene, material), scene.reduced.view.constraints, 0
+    basis = scene.reduced.view.basis
 
     def spin():
         linear, angular = scene.momentum()
@@ -143,8 +144,9 @@ def test_tumbling_bounce(modulus, dt):
         scene.step()
         count = int(constraints.count.numpy()[0])
         force = constraints.force.numpy()[0, :count]
-        rows = constraints.row.numpy()[0, :count]  # forces act where the functions are, inside the skin
-        place = (scene.state.particle_q.numpy() - scene.state.softmode.dent.numpy())[rows].astype(float)
+        rows = constraints.row.numpy()[0, :count]  # forces act where the functions are, at centres of pressure
+        values = basis.row.numpy().reshape(len(basis.row), -1)[rows, : brick().function_count]
+        place = basis.row_point.numpy()[rows] + values @ scene.q()
         moment = np.cross(place - scene.centre(), force).sum(axis=0)
         total = np.linalg.norm(force, axis=1).sum() + scene.mass() * GRAVITY
         pressed += total > 3.0 * scene.mass() * GRAVITY

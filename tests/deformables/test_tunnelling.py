@@ -187,7 +187,7 @@ def test_body_bent_around_an_end(friction):
         constraints = scene.reduced.view.constraints
         count = int(constraints.count.numpy()[0])
         force = constraints.force.numpy()[0, :count, 2]
-        found = beyond[constraints.row.numpy()[0, :count]]
+        found = beyond[constraints.partner_row.numpy()[0, :count]]
         assert beyond.sum() > 10 and (force[found] > 0.0).any() == (touched or not known)
         remembered = scene.state.softmode.stick_shape.numpy()[beyond, 0] == 0
         assert remembered.any() == (touched or not known)

@@ -172,16 +172,11 @@ def _own_env(names: dict[str, Any], folder: Path) -> None:
 
 @_result("docs/howto/tune_a_material.md")
 def _tune_a_material(names: dict[str, Any], folder: Path) -> None:
-    """A block sinks by rho g h^2 / (2 E), but for the contact's own 0.03 mm, and by the dent of its foot.
-
-    That is rho g h w, w = 0.30 (V / n)^(1/3) / E; samples at the edges carry a little more than the mean pressure.
-    """
+    """A block sinks by rho g h^2 / (2 E), but for the contact's own 0.03 mm; its whole foot has hardly a dent."""
     edge, pressure = names["edge"], names["density"] * 9.81 * names["edge"]
-    size = edge / names["cube"].function_count ** (1.0 / 3.0)
     for modulus, sink in names["sinks"].items():
-        dent = names["dents"][modulus]
-        np.testing.assert_allclose(dent, 0.30 * size * pressure / modulus, rtol=0.1)
-        np.testing.assert_allclose(sink - dent, 0.5 * pressure * edge / modulus, rtol=0.02, atol=5e-5)
+        assert names["dents"][modulus] < 0.01 * sink
+        np.testing.assert_allclose(sink, 0.5 * pressure * edge / modulus, rtol=0.02, atol=5e-5)
 
 
 @_result("docs/howto/train.md")

@@ -154,6 +154,64 @@ def test_plenoxels(tmp_path):
     np.testing.assert_allclose(field.sh[2, 2, 2, 4], arrays["sh_data"][7, [4, 13, 22]])
 
 
+def plenoctree(**changes) -> dict[str, np.ndarray]:
+    """Return an octree in svox's layout: an eighth of the box is split again, and full of one colour."""
+    child = np.zeros((2, 2, 2, 2), np.int32)
+    child[0, 1, 0, 1] = 1
+    data = np.zeros((2, 2, 2, 2, 28), np.float16)
+    data[0, 0, 1, 0, -1], data[0, 0, 1, 0, 0] = 5.0, 2.0  # sigma; red's constant coefficient
+    data[1, 1, 1, 0, -1] = 40.0
+    arrays = {"child": child, "data": data, "data_format": np.array("SH9"), "invradius3": np.full(3, 0.5)}
+    return arrays | {"offset": np.full(3, 0.5), "depth_limit": np.array(10)} | changes
+
+
+def test_plenoctree(tmp_path):
+    """Cell i lies at ((i + 1/2) / n - offset) / invradius; larger leaves fill several; colours are sigmoids."""
+    np.savez_compressed(tmp_path / "tree.npz", **plenoctree())
+    assert is_radiance(tmp_path / "tree.npz")
+    field = read_radiance(tmp_path / "tree.npz")
+    assert field.shape == (4, 4, 4)
+    places = field.origin + np.array([[3, 1, 2], [0, 2, 0], [1, 3, 1], [0, 0, 0]]) @ field.axes.T
+    np.testing.assert_allclose(places[:2], [[0.75, -0.25, 0.25], [-0.75, 0.25, -0.75]])
+    np.testing.assert_allclose(field.densities(places), [40.0, 5.0, 5.0, 0.0])
+    sigmoid = 1.0 / (1.0 + np.exp(-2.0 * 0.28209479))
+    shades = field.colors(places[:2], np.array([[1.0, 0.0, 0.0], [0.6, 0.0, 0.8]]))
+    np.testing.assert_allclose(shades, [[0.5, 0.5, 0.5], [sigmoid, 0.5, 0.5]], atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("changes", "word"),
+    [
+        ({"data_format": np.array("SG25")}, "SG25"),
+        ({"data": np.zeros((2, 2, 2, 2, 4), np.float16)}, "match"),
+        ({"child": np.ones((2, 2, 2, 2), np.int32)}, "not there"),
+        ({"child": -np.ones((2, 2, 2, 2), np.int32)}, "not there"),
+        ({"invradius3": np.zeros(3)}, "box"),
+    ],
+)
+def test_damaged_plenoctrees(tmp_path, changes, word):
+    """What is no tree, or has a learned basis, is refused."""
+    np.savez(tmp_path / "tree.npz", **plenoctree(**changes))
+    with pytest.raises(AssetError, match=word):
+        read_radiance(tmp_path / "tree.npz")
+
+
+def test_metres_and_large_packed_files(tmp_path):
+    """A field says the metres of its unit, through files and scale; one that packs to a tenth is read."""
+    field = RadianceGrid(**small(), metres=0.5)
+    write_radiance(tmp_path / "a.npz", field)
+    assert read_radiance(tmp_path / "a.npz").metres == 0.5
+    assert field.transformed(scale=0.5).metres == 1.0
+    with pytest.raises(AssetError, match="metres"):
+        RadianceGrid(**small(), metres=-1.0)
+    density = np.zeros((160,) * 3, np.float32)
+    density[60:90, 60:90, 60:90] = 100.0
+    box, rgb = np.array([[-1.0] * 3, [1.0] * 3]), np.zeros((*density.shape, 3), np.float32)
+    np.savez_compressed(tmp_path / "b.npz", density=density, rgb=rgb, bounds=box, metres=np.array(1.0))
+    found = read_radiance(tmp_path / "b.npz")
+    assert found.metres == 1.0 and found.shape == density.shape
+
+
 @pytest.mark.parametrize(
     ("changes", "word"),
     [

@@ -5,6 +5,8 @@ Builds objects from fields, which is what it tests.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -12,7 +14,7 @@ from softmode.cli.main import main
 from softmode.errors import AssetError, ConfigError
 from softmode.objects import ObjectConfig, Placed, build_object, load, write_object
 from softmode.objects.object_file import file_kind, read_object
-from softmode.radiance import write_radiance
+from softmode.radiance import read_radiance, write_radiance
 from softmode.scenes import SplatScene
 from softmode.splats import PinholeCamera, read_splats
 from tests.radiance.fields import SIZE, block_field, psnr
@@ -47,6 +49,43 @@ def test_a_field_becomes_an_object(file):
     assert turned.radiance is not None and np.ptp(turned.radiance.bounds, axis=0).argmax() == 2
     built, _ = build_object(file, **OPTIONS)
     assert built.radiance is not None and built.body.provenance["asset_kind"] == "radiance"
+
+
+def test_a_field_keeps_its_metres():
+    """One that says them is as large as it is, and `field_pose` takes its places to where the object has them."""
+    given = replace(block_field(), metres=0.5)
+    thing = load(given, **OPTIONS | {"size": None, "up": "+x"})
+    assert thing.radiance is not None and thing.field_pose is not None and not thing.findings()
+    assert np.prod(SIZE) < 8.0 * thing.body.volume < np.prod(np.array(SIZE) + 0.0045)
+    places = np.random.default_rng(0).uniform(-0.02, 0.02, (50, 3))
+    there = places @ thing.field_pose[:3, :3].T + thing.field_pose[:3, 3]
+    np.testing.assert_allclose(thing.radiance.densities(there), 2.0 * given.densities(places), rtol=2e-3)
+    np.testing.assert_allclose(np.cbrt(np.linalg.det(thing.field_pose[:3, :3])), 0.5)
+
+
+def test_sampled_functions(tmp_path, monkeypatch, capsys):
+    """A function in Python comes to a grid around its object; what has no end, is empty or no function is refused."""
+    (tmp_path / "my_nerf.py").write_text(
+        "import numpy as np\n"
+        "def ball(x):\n    return 300.0 * (np.linalg.norm(x - 3.0, axis=1) < 0.5), 0.0 * x\n"
+        "def space(x):\n    return np.abs(x[:, 0]), 0.0 * x\n"
+        "def nothing(x):\n    return 0.0 * x[:, 0], 0.0 * x\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    assert (
+        main(["radiance", "sample", "my_nerf:ball", "ball.npz", "--bounds", *"2 2 2 4 4 4".split(), "--metres", "1"])
+        == 0
+    )
+    found = read_radiance("ball.npz")
+    assert found.metres == 1.0
+    np.testing.assert_allclose(found.bounds, [[2.5] * 3, [3.5] * 3], atol=0.07)
+    for name, said in (("space", "no end"), ("nothing", "empty"), ("none", "no attribute"), ("", "MODULE:FUNCTION")):
+        assert main(["radiance", "sample", f"my_nerf:{name}" if name else "my_nerf", "x.npz"]) == 2
+        assert said in capsys.readouterr().err
+    for suffix in (".ingp", ".vdb", ".th"):
+        (tmp_path / f"a{suffix}").write_bytes(b"x")
+        assert main(["radiance", "info", f"a{suffix}"]) == 2
+        assert "Convert it: " in capsys.readouterr().err
 
 
 def test_the_file_of_an_object_keeps_its_field(file, tmp_path):
@@ -102,7 +141,7 @@ def test_commands(file, tmp_path, capsys):
     """`radiance info` prints what is in the file, `bake` writes splats; what is wrong ends with 2 and a remedy."""
     assert main(["radiance", "info", str(file)]) == 0
     said = capsys.readouterr().out
-    assert "sh degree   0" in said and "97 x" in said
+    assert "sh degree   0" in said and "97 x" in said and "adds 2%" in said and "fog" not in said
     out = tmp_path / "block.ply"
     given = ["--count", "800", "--iterations", "10", "--pixels", "48", "--out", str(out)]
     assert main(["radiance", "bake", str(file), *given]) == 0

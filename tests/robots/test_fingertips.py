@@ -90,5 +90,5 @@ def test_hand_holds_a_ball(hand: robots.RobotDescription, tips: robots.Fingertip
     np.testing.assert_allclose(-wrench.sum(0), (0.0, 0.0, weight), atol=0.01 * weight)
     assert scene.rigid_gaps().min() > -0.02 * RADIUS
     scene.control.joint_target_q.assign(tips.joint_q(around(0.01), squeezing)[0].astype(np.float32))  # lets go
-    assert scene.momentum_error(24) < 1e-5 * weight * scene.dt
+    assert scene.momentum_error(24) < 2e-5 * weight * scene.dt
     assert not scene.solver.status.numpy().any()

@@ -1,13 +1,12 @@
 """Device code of the dents that a step leaves: how far the skin lies outside of what the functions of a body say.
 
-A contact sinks in by p = x + v: the penalty takes x, the dent v, see ``penalty_kernels``. The functions move
-a sample by p; the skin that one sees and touches has moved by v less, along the normal of the contact.
+A sample sinks in by p = x + v: the penalty takes x, the dent v, r / (1 + r) of it, see ``penalty_kernels``. The
+functions move a sample by p; the skin that one sees and touches has moved by v less, along the normal of the contact.
 """
 
 import warp as wp
 
 from softmode.deformables.contact.pair_kernels import Pairs
-from softmode.deformables.contact.penalty_kernels import dent_compliance, dented_penalty
 from softmode.deformables.model.struct_kernels import SLOTS, Instances, PointConstraints, Samples
 
 wp.set_module_options({"enable_backward": False})
@@ -23,13 +22,13 @@ def with_dent(dent: wp.vec3, normal: wp.vec3, depth: float):
 
 
 @wp.func
-def own_dent(constraints: PointConstraints, smoothing: float, share: wp.float64, i: int, e: int):
+def own_dent(constraints: PointConstraints, share: float, i: int, e: int):
     """Return the dent [m] of a body at a contact, of which ``share`` is its part where two give way; 0 if no number."""
     total = constraints.offset[i, e] + constraints.displacement[i, e]
     ratio = constraints.stiffness[i, e] * constraints.dent_compliance[i, e]
     penetration = -wp.dot(constraints.normal[i, e], total)
-    _psi, slope, _curvature = dented_penalty(penetration, wp.float64(smoothing), ratio)
-    depth = float(share * ratio * slope)
+    sunk = wp.max(penetration - constraints.lead[i, e], wp.float64(0.0))
+    depth = share * float(ratio / (wp.float64(1.0) + ratio) * sunk)
     return wp.where(wp.isfinite(depth), depth, 0.0)
 
 
@@ -49,7 +48,7 @@ def leave_dents(
     for slot in range(SLOTS):
         e = samples.constraint[i, s, slot]
         if e >= 0:
-            depth = own_dent(constraints, instances.smoothing[i], wp.float64(1.0), i, e)
+            depth = own_dent(constraints, 1.0, i, e)
             dent = with_dent(dent, wp.vec3(constraints.normal[i, e]), depth)
     dent_out[instances.particle_start[i] + s] = dent
 
@@ -57,8 +56,6 @@ def leave_dents(
 @wp.kernel
 def leave_pair_dents(
     instances: Instances,
-    relative_stiffness: wp.array[float],  # (sample_total,), Young's modulus relative to the body's
-    dent_length: wp.array[float],  # (sample_total,), see ``dents`` [m]
     pairs: Pairs,
     constraints: PointConstraints,
     # State in and out:
@@ -68,17 +65,10 @@ def leave_pair_dents(
     i, s = wp.tid()
     if s >= instances.sample_count[i] or pairs.near[i] == 0:
         return
-    own = instances.row_start[i] + s
     particle = instances.particle_start[i] + s
     for slot in range(SLOTS):
         e = pairs.held[i, s, slot]
         if e < 0:
             continue
-        j = pairs.other[i, s, slot]
-        at = instances.row_start[j] + pairs.nearest[i, s, slot]
-        mine = dent_compliance(instances, i, relative_stiffness[own], dent_length[own])
-        theirs = dent_compliance(instances, j, relative_stiffness[at], dent_length[at])
-        if mine > 0.0:
-            smoothing = wp.min(instances.smoothing[i], instances.smoothing[j])
-            depth = own_dent(constraints, smoothing, wp.float64(mine / (mine + theirs)), i, e)
-            dent[particle] = with_dent(dent[particle], wp.vec3(constraints.normal[i, e]), depth)
+        depth = own_dent(constraints, pairs.share[i, s, slot], i, e)
+        dent[particle] = with_dent(dent[particle], wp.vec3(constraints.normal[i, e]), depth)

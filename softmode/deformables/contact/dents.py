@@ -3,11 +3,11 @@
 n functions in a volume V resolve patches of the size h = (V / n)^(1/3). What a narrower patch would press in beyond
 their motion is, per pressure,
 
-    w = 0.30 h (1 - nu^2) / E,
+    w = 0.30 h (1 - nu^2) / E (1 - c^2),
 
-a bed of springs (Winkler) of the scale that is missing, in series with the penalty of contact. It was fitted to pairs
-of opposite discs on cubes, beams, pads and spheres of 28 to 68 functions against 2,000 kernels: radii of 12 to 18 mm on
-bodies of 100 mm then give 0.88 to 1.1 of the fine compliance, where the functions alone give 0.3 to 0.7. A wall is no
+a bed of springs (Winkler) of the scale that is missing, in series with the penalty of contact, less with the share c of
+the neighbourhood that touches: what presses on a whole face, the functions carry. It was fitted to pairs
+of opposite discs on cubes, beams, pads and spheres of 28 to 68 functions against 2,000 kernels. A wall is no
 softer than itself: h is bounded by a share of its thickness.
 
 What is drawn of a body lies on its skin. It follows the dents that a step leaves at the samples near it, and less the
@@ -16,22 +16,34 @@ deeper it lies: see `dent_weights`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import warp as wp
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
 from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.contact.cell_kernels import Surface
 from softmode.deformables.contact.pairs import thickness
 from softmode.deformables.model.struct_kernels import VANISHING, PointConstraints
+from softmode.deformables.model.tables import allocate
 
 Array = NDArray[np.float64]
 
 DENT_FACTOR = 0.30
-"""Dent over the size of what the functions resolve, under the pressure E / (1 - nu^2)."""
+"""Dent over the size of what the functions resolve, under the pressure E / (1 - nu^2), where nothing around is touched.
+"""
 WALL_SHARE = 0.6
 """Bound of that size as a share of the thickness below a sample."""
+COVER = 1.6
+"""Radius over the resolved size of the neighbourhood whose touched share a dent is less by. A wall does not cut it."""
+CARRIED = 0.99
+"""c where all of the neighbourhood touches. What is left of the dent softens a squeeze by 1 %
+at most; without it, a dent that comes and goes with gaps of micrometres costs a grasp iterations."""
+THIN = 3.0
+"""Thicknesses below which a body is thin: contact then sinks in by a share of them, not of its size."""
 NEAREST = 4
 """Surface samples whose dents move a point: a plush on its feet then shows 0.18 mm below the floor, with three 0.24,
 with eight 0.17."""
@@ -66,6 +78,68 @@ def dent_lengths(body: ReducedBody) -> Array:
     return np.where(free, DENT_FACTOR * np.minimum(resolved_size(body), WALL_SHARE * thickness(body)), 0.0)
 
 
+def neighbourhoods(body: ReducedBody) -> list[tuple[NDArray[np.int64], Array]]:
+    """Return the samples around each that face the same way within 60 degrees, and their weights, of sum CARRIED."""
+    x, n, area = body.surface.points, body.surface.normals, body.surface.areas
+    radius = np.maximum(COVER * resolved_size(body), 1.5 * np.sqrt(area))
+    found = []
+    for s, near in enumerate(KDTree(x).query_ball_point(x, radius)):
+        same = np.array(near)[n[near] @ n[s] > 0.5]
+        weight = area[same] * np.maximum(1.0 - ((x[same] - x[s]) ** 2).sum(axis=1) / radius[s] ** 2, 1e-3)
+        found.append((same, CARRIED * weight / weight.sum()))
+    return found
+
+
+def mean_curvature(body: ReducedBody) -> Array:
+    """Return the mean curvature at the samples [1/m], from the eight nearest whose normals are within 45 degrees."""
+    x, n = body.surface.points, body.surface.normals
+    near = KDTree(x).query(x, min(9, len(x)))[1].reshape(len(x), -1)[:, 1:]
+    d, dn = x[near] - x[:, None], n[near] - n[:, None]
+    same = np.einsum("ik,ijk->ij", n, n[near]) > 0.7
+    return (same * (d * dn).sum(-1)).sum(1) / np.maximum((same * (d * d).sum(-1)).sum(1), 1e-30)
+
+
+def surface_table(
+    bodies: Sequence[ReducedBody], stiffness: Array, first_row: int, row_max: int, device: wp.Device
+) -> Surface:
+    """Return what contact knows of the surfaces of all bodies.
+
+    Args:
+        bodies: The bodies.
+        stiffness: Young's modulus at all samples relative to that of their body.
+        first_row: First of the rows at centres of pressure.
+        row_max: Such rows of an instance.
+        device: Where the table lies.
+    """
+    around = [pair for body in bodies for pair in neighbourhoods(body)]
+    given = {
+        "relative_stiffness": stiffness,
+        "dent_length": np.concatenate([dent_lengths(body) for body in bodies]),
+        "slenderness": np.concatenate([slenderness(body) for body in bodies]),
+        "curvature": np.concatenate([mean_curvature(body) for body in bodies]),
+        "start": np.cumsum([0, *(len(samples) for samples, _weights in around)]),
+        "neighbour": np.concatenate([samples for samples, _weights in around]),
+        "weight": np.concatenate([weights for _samples, weights in around]),
+        "first_row": first_row,
+        "row_max": row_max,
+    }
+    return allocate(Surface, "", {}, device, given=given)
+
+
+def sample_room(body: ReducedBody, margin: float) -> int:
+    """Return how many contacts the samples of a body may have at a time where they are found within so many sizes.
+
+    Two where both sides of a thin part may be near what touches one of them.
+    """
+    thin = thickness(body) < 4.0 * margin * np.linalg.norm(np.ptp(body.bounds, axis=0))
+    return body.surface_count + int(thin.sum())
+
+
+def slenderness(body: ReducedBody) -> Array:
+    """Return the size of a body over the smaller of it and THIN thicknesses, at its samples."""
+    return np.maximum(np.linalg.norm(np.ptp(body.bounds, axis=0)) / (THIN * thickness(body)), 1.0)
+
+
 def dent_weights(body: ReducedBody, points: ArrayLike) -> DentWeights:
     """Return how points of a body follow the dents of its surface samples.
 
@@ -95,9 +169,10 @@ def dent_weights(body: ReducedBody, points: ArrayLike) -> DentWeights:
 def contact_dents(constraints: PointConstraints) -> Array:
     """Return how far the bodies give way at the contacts of the last step [m], shape (instance_count, constraint_max).
 
-    Of two soft bodies the sum. Counts for contacts; pins and what lies beyond the count of an instance mean nothing.
-    Reads from the device.
+    At the samples; of two soft bodies the sum. Counts for contacts; pins and what lies beyond the count of an instance
+    mean nothing. Reads from the device.
     """
-    pressed = np.einsum("nek,nek->ne", constraints.normal.numpy(), constraints.force.numpy())
-    give = constraints.dent_compliance.numpy() * np.maximum(pressed, 0.0)
-    return np.minimum(give, constraints.dent_depth.numpy())  # from there on the stiffer penalty carries
+    total = constraints.offset.numpy() + constraints.displacement.numpy()
+    sunk = -np.einsum("nek,nek->ne", constraints.normal.numpy(), total) - constraints.lead.numpy()
+    ratio = constraints.stiffness.numpy() * constraints.dent_compliance.numpy()
+    return ratio / (1.0 + ratio) * np.maximum(sunk, 0.0)

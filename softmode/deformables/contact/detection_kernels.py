@@ -10,16 +10,31 @@ contact records are appended by an atomic counter: fixed slots per sample keep t
 
 import warp as wp
 
+from softmode.deformables.contact.cell_kernels import (
+    NEAR,
+    Surface,
+    ahead_of,
+    cell_at,
+    fade_of,
+    gradient_of,
+    shape_curvature,
+    shape_of_cell,
+    touched_share,
+    write_row,
+)
 from softmode.deformables.contact.penalty_kernels import (
     BULK_FACTOR,
+    HARDENING_DEPTH,
     SHEAR_FACTOR,
     dent_compliance,
     dent_depth,
+    shear_yield,
     stiffness_per_area,
 )
 from softmode.deformables.contact.shape_query_kernels import (
     HEIGHTFIELD,
     PLANE,
+    SMOOTH,
     Heightfields,
     SurfaceQuery,
     query_heightfield,
@@ -214,13 +229,14 @@ def march(
     end: float,
     back: int,
     thick: float,
+    onset: float,
     reach: float,
 ):
     """Return gap and normal of the half-space that stands for a shape along a way from ``x``, in the shape's frame.
 
     The way is marched by distances to the shape grown by ``thick``. To the body's inside (``back``), for a sample past
     the middle of a thin plate or through it: where the way leaves the shape, else what is ``nearest`` to x. The way of
-    a fast sample: where it first meets the shape, or else passes nearest.
+    a fast sample: where it first meets the shape, or else passes nearest, with no ``onset`` of its contact.
     """
     kind = shapes.kind[shape]
     scale = shapes.scale[shape]
@@ -260,7 +276,9 @@ def march(
     slope = wp.dot(out.normal, along)
     out.distance -= out_at * slope
     if back == 0 and not inside:
-        out.distance = wp.max(out.distance, -end * slope)  # a way that misses the shape misses its half-space
+        # a way that misses the shape misses its half-space, and where it begins outside of the onset that too
+        clear = wp.where(nearest.distance > onset, onset, 0.0)
+        out.distance = wp.max(out.distance, clear - end * slope)
     return out
 
 
@@ -341,7 +359,7 @@ def find_contacts(
             along = wp.quat_rotate_inv(turn, drift) / travel
             end = travel
         if end > 0.0:
-            query = march(shapes, shape, local, query, along, end, back, thick, far)
+            query = march(shapes, shape, local, query, along, end, back, thick, instances.smoothing[i], far)
         gap = wp.float64(query.distance)
         if gap < wp.float64(reach) and gap < samples.gap[i, s, 1]:
             normal = wp.quat_rotate(turn, query.normal)
@@ -377,6 +395,23 @@ def shape_area(shapes: Shapes, shape: int):
         return float(1.0e30)
     edge = shapes.upper[shape] - shapes.lower[shape]
     return 2.0 * (edge[0] * edge[1] + edge[1] * edge[2] + edge[2] * edge[0])
+
+
+@wp.func
+def curvature_of(shapes: Shapes, shape: int, normal: wp.vec3d):
+    """Return the mean curvature [1/m] of a shape where its normal is ``normal``."""
+    _origin, rotation = shape_frame(shapes, shape)
+    axis = wp.quat_rotate(rotation, wp.vec3d(wp.float64(0.0), wp.float64(0.0), wp.float64(1.0)))
+    return shape_curvature(shapes.kind[shape], shapes.scale[shape], float(wp.dot(axis, normal)))
+
+
+@wp.func
+def shape_drift(shapes: Shapes, shape: int, x: wp.vec3, dt: float):
+    """Return how far a point of a shape moves in a step at its velocity [m]."""
+    body = shapes.body[shape]
+    if body < 0:
+        return wp.vec3()
+    return dt * point_velocity(shapes.body_q[body], shapes.body_qd[body], shapes.body_com[body], x)
 
 
 @wp.func
@@ -462,8 +497,8 @@ def gather_contacts(
     basis: Basis,
     shapes: Shapes,
     samples: Samples,
-    relative_stiffness: wp.array[float],  # (sample_total,), Young's modulus relative to the body's
-    dent_length: wp.array[float],  # (sample_total,), see ``dents`` [m]
+    motion: Motion,
+    surface: Surface,
     constraint_max: int,
     prescribed: int,
     stick_ratio: wp.float64,
@@ -523,9 +558,37 @@ def gather_contacts(
         gap = wp.max(samples.gap[i, s, slot], deepest)
         # of unit length in float64: what is left of the gap in the slip must not count against the stick range
         normal = wp.normalize(wp.vec3d(samples.normal[i, s, slot]))
-        # both bodies feel the force at the sample, not the shape at its own surface: a pair of forces on two
+        cell_shape = shape_of_cell(surface, instances, basis, i, row, curvature_of(shapes, shape, normal))
+        start = wp.mat33d()
+        ahead = wp.mat33d()
+        closing = wp.float64(0.0)
+        spared = float(1.0)
+        if gap <= NEAR * cell_shape.steepest:
+            start = gradient_of(instances, basis, motion.q_start, i, row)
+            ahead, closing = ahead_of(instances, basis, motion, start, normal, i, row, dt)
+            closing -= wp.dot(normal, wp.vec3d(shape_drift(shapes, shape, wp.vec3(samples.position[i, s]), dt)))
+            fade = fade_of(cell_shape, ahead, normal)
+            touched = touched_share(surface, samples.shape, samples.gap, cell_shape, fade, i, row, shape)
+            spared = float(wp.float64(1.0) - touched * touched)
+        area = wp.max(sample_area(instances.scale[i], basis.row_area[row]), 1.0e-30)
+        relative = surface.relative_stiffness[row]
+        partner_mass = float(0.0)
+        if shapes.body[shape] >= 0 and prescribed == 0:
+            partner_mass = shapes.body_mass[shapes.body[shape]]
+        partner_area = shape_area(shapes, shape)
+        firm = relative * surface.slenderness[row]
+        kappa = stiffness_per_area(instances, i, BULK_FACTOR, firm, partner_mass, partner_area, dt)
+        stiffness = wp.float64(kappa * area)
+        compliance = wp.float64(spared * dent_compliance(instances, i, relative, surface.dent_length[row]) / area)
+        share = float(1.0)
+        if partner_mass > 0.0:  # what is light beside the body turns faster than its cells, which lag by a step
+            share = partner_mass / (partner_mass + float(instances.mass[i]))
+        ratio = stiffness * compliance * wp.float64(share * share)
+        cell = cell_at(cell_shape, ahead, normal, gap, closing, ratio)
+        turned = wp.dot(normal, (ahead - start) * cell.centre)
+        # both bodies feel the force at one point, not the shape at its own surface: a pair of forces on two
         # points would make angular momentum out of friction times penetration
-        point = wp.vec3(samples.position[i, s])
+        point = wp.vec3(samples.position[i, s] + start * cell.centre)
         drift = wp.vec3()
         arm = wp.vec3()
         body = shapes.body[shape]
@@ -540,16 +603,8 @@ def gather_contacts(
         constraints.body[i, e] = body
         constraints.arm[i, e] = arm
         constraints.normal[i, e] = normal
-        partner_mass = float(0.0)
-        if body >= 0 and prescribed == 0:
-            partner_mass = shapes.body_mass[body]
-        relative = relative_stiffness[row]
-        partner_area = shape_area(shapes, shape)
-        kappa = stiffness_per_area(instances, i, BULK_FACTOR, relative, partner_mass, partner_area, dt)
         shear = stiffness_per_area(instances, i, SHEAR_FACTOR, relative, partner_mass, partner_area, dt)
-        area = wp.max(sample_area(instances.scale[i], basis.row_area[row]), 1.0e-30)
-        stiffness = wp.float64(kappa * area)
-        compliance = dent_compliance(instances, i, relative, dent_length[row]) / area
+        edged = (SMOOTH >> shapes.kind[shape]) & 1 == 0
         slip, anchor = remembered_slip(
             shapes,
             shape,
@@ -561,12 +616,21 @@ def gather_contacts(
             prescribed,
         )
         # d enters as offset + displacement, with the gap along the normal and the shape's own motion taken off
-        constraints.offset[i, e] = gap * normal + slip - wp.vec3d(drift)
+        constraints.offset[i, e] = (gap - turned - cell.lead) * normal + slip - wp.vec3d(drift)
+        constraints.lead[i, e] = cell.lead
+        constraints.onset[i, e] = cell.onset
         constraints.anchor[i, e] = anchor
-        constraints.stick[i, e] = stick_ratio * wp.float64(shear * area)
+        stick = stick_ratio * wp.float64(shear * area)
+        constraints.stick_deep[i, e] = stick
+        constraints.stick[i, e] = stick / (wp.float64(1.0) + stick * shear_yield(instances, i, compliance))
         constraints.stiffness[i, e] = stiffness
-        constraints.dent_compliance[i, e] = wp.float64(compliance)
-        constraints.dent_depth[i, e] = wp.float64(dent_depth(instances, i, dent_length[row]))
+        constraints.dent_compliance[i, e] = compliance
+        depth = dent_depth(instances, i, surface.dent_length[row], edged)
+        constraints.dent_depth[i, e] = wp.float64(spared * depth) + HARDENING_DEPTH * cell_shape.least
+        constraints.partner_row[i, e] = row
+        if wp.length_sq(cell.centre) > wp.float64(0.0):
+            constraints.row[i, e] = surface.first_row + i * surface.row_max + e
+            write_row(basis, constraints.row[i, e], row, cell.centre)
         constraints.friction[i, e] = wp.float64(wp.sqrt(instances.friction[i] * shapes.friction[shape]))
 
 

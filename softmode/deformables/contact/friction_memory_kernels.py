@@ -7,6 +7,7 @@ memory of a sample is, per slot, the shape it sticks to and a point in that shap
 import warp as wp
 
 from softmode.deformables.contact.detection_kernels import Shapes, shape_frame
+from softmode.deformables.contact.penalty_kernels import elastic_slip
 from softmode.deformables.model.struct_kernels import SLOTS, Instances, PointConstraints, Samples, in_mask, mat23d
 
 wp.set_module_options({"enable_backward": False})
@@ -45,22 +46,21 @@ def remember_slip(
         shape = constraints.shape[i, e]
         origin, rotation = shape_frame(shapes, shape)
         total = constraints.slip[i, e]
-        stretch = constraints.stick[i, e] * wp.length(total)
-        if not wp.isfinite(stretch + limit):
+        slid = wp.length(total)
+        most = elastic_slip(limit, constraints.stick[i, e], constraints.stick_deep[i, e], constraints.dent_depth[i, e])
+        if not wp.isfinite(slid + most):
             continue
-        elastic = wp.vec3d()
-        if stretch > limit:
-            elastic = limit / stretch * total
-        elif stretch > wp.float64(0.0):
-            elastic = total
+        elastic = total
+        if slid > most:
+            elastic = most / slid * total
         point = constraints.anchor[i, e]
         if prescribed != 0:
             point = wp.quat_rotate_inv(rotation, elastic)
-        elif stretch > limit or constraints.stick[i, e] == wp.float64(0.0):
+        elif slid > most:
             n = constraints.normal[i, e]
             before = constraints.offset[i, e] - wp.dot(n, constraints.offset[i, e]) * n
-            slid = samples.position[i, s] - before + total - elastic
-            point = wp.quat_rotate_inv(rotation, slid - origin)
+            held = samples.position[i, s] - before + total - elastic
+            point = wp.quat_rotate_inv(rotation, held - origin)
         stuck[slot] = shape
         points[slot] = point
     particle = instances.particle_start[i] + s

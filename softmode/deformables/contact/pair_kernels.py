@@ -3,13 +3,14 @@
 The surface of a body is what its samples x_k with deformed normals n_k say: near a point x the implicit moving
 least-squares surface (Kolluri 2008, doi:10.1145/1361192.1361195, eq. 1)
 
-    gap(x) = sum_k theta_k n_k . (x - x_k) / sum_k theta_k,
+    gap(x) = sum_k theta_k (n_k . (x - x_k) + H_k d_k^2 / 2) / sum_k theta_k,
     theta_k = exp(-(|x - x_k|^2 - d_min^2) / h^2) max(-n . n_k - c, 0)^2,
 
-h three quarters of the spacing of the samples, n the normal of the sample at x, c = 0.3: exact for a plane, without the
-bumps that a ball around every sample would have, and blind to what lies around a sharp edge. Samples of each body are
-tested against the surfaces of the others. What is touched of the other body is the material at x, less the gap n that
-has to close before,
+h three quarters of the spacing of the samples, n the normal of the sample at x, c = 0.3, d_k the distance across n_k
+and H_k the mean curvature at rest, by which the surface falls off its tangent planes: else a coarse ball reaches 0.6 mm
+too far. It is exact for a plane, to second order for a sphere, has none of the bumps of a ball around every sample, and
+is blind to what lies around a sharp edge. Samples of each body are tested against the surfaces of the others. What is
+touched of the other body is the material at x, less the gap n that has to close before,
 
     sum_k theta_k b(X_k) / sum_k theta_k + grad b(X_t) . F_t^-1 (x - max(gap, 0) n - sum_k theta_k x_k / sum_k theta_k),
 
@@ -24,16 +25,26 @@ whose row is the difference.
 
 import warp as wp
 
+from softmode.deformables.contact.cell_kernels import (
+    Surface,
+    cell_at,
+    fade_of,
+    gradient_of,
+    shape_of_cell,
+    touched_share,
+)
 from softmode.deformables.contact.detection_kernels import rank_contacts
 from softmode.deformables.contact.penalty_kernels import (
     BULK_FACTOR,
+    HARDENING_DEPTH,
     SHEAR_FACTOR,
     dent_compliance,
     dent_depth,
+    elastic_slip,
+    shear_yield,
     stiffness_per_area,
 )
 from softmode.deformables.model.declare import struct
-from softmode.deformables.model.deformation_kernels import displacement_gradient
 from softmode.deformables.model.lane_kernels import vec8
 from softmode.deformables.model.status import WORLD_CONTACT_OVERFLOW, WORLD_PENETRATION
 from softmode.deformables.model.struct_kernels import (
@@ -96,6 +107,7 @@ class Pairs:
     gap: wp.array3d[wp.float64]  # (..., SLOTS) [m]
     normal: wp.array3d[wp.vec3d]  # (..., SLOTS), outward from the other body
     nearest: wp.array3d[int]  # (..., SLOTS), its nearest sample
+    share: wp.array3d[float]  # (..., SLOTS), of the sample's own body in the dent of both
     tally: wp.array3d[int]  # (instance_count, team, 2), scratch of the list
     held: wp.array3d[int]  # (..., SLOTS), the point constraint it became, -1 for none
     count: wp.array[int]  # (instance_count,)
@@ -112,14 +124,6 @@ class Patch:
     gap: wp.float64  # [m]
     normal: wp.vec3d
     drift: wp.vec3  # mean motion of the step [m]
-
-
-@wp.func
-def gradient_at(instances: Instances, basis: Basis, motion: Motion, i: int, s: int):
-    """Return the deformation gradient F of an instance at a surface sample, at the start of the step."""
-    row = instances.row_start[i] + s
-    G = displacement_gradient(basis.row_gradient, motion.q_start, i, row, instances.function_count[i])
-    return wp.identity(n=3, dtype=wp.float64) + G
 
 
 @wp.func
@@ -179,7 +183,7 @@ def place_surface(
     i, s = wp.tid()
     if s >= instances.sample_count[i] or pairs.near[i] == 0:
         return
-    F = gradient_at(instances, basis, motion, i, s)
+    F = gradient_of(instances, basis, motion.q_start, i, instances.row_start[i] + s)
     normal = wp.normalize(cofactor(F) * wp.vec3d(basis.row_normal[instances.row_start[i] + s]))
     pairs.surface_normal[i, s] = wp.vec3(normal)
 
@@ -251,7 +255,17 @@ def beside(samples: Samples, pairs: Pairs, x: wp.vec3d, j: int, row: int, centre
 
 
 @wp.func
-def fit_patch(instances: Instances, basis: Basis, samples: Samples, pairs: Pairs, i: int, s: int, j: int, t: int):
+def fit_patch(
+    instances: Instances,
+    basis: Basis,
+    samples: Samples,
+    curvature: wp.array[float],
+    pairs: Pairs,
+    i: int,
+    s: int,
+    j: int,
+    t: int,
+):
     """Fit the surface of instance j near sample s of instance i; t is its nearest sample, as ``find_pairs`` says."""
     patch = Patch()
     x = samples.position[i, s]
@@ -265,8 +279,10 @@ def fit_patch(instances: Instances, basis: Basis, samples: Samples, pairs: Pairs
             away = x - samples.position[j, u]
             theta = weigh(samples, pairs, i, s, j, u, t)
             n = wp.vec3d(pairs.surface_normal[j, u])
+            height = wp.dot(n, away)
+            bend = 0.5 * curvature[instances.row_start[j] + u] / instances.scale[j]
             patch.total += theta
-            patch.gap += theta * wp.dot(n, away)
+            patch.gap += theta * (height + wp.float64(bend) * (wp.length_sq(away) - height * height))
             patch.normal += theta * n
             patch.drift += float(theta) * samples.drift[j, u]
             offset += theta * away
@@ -314,6 +330,7 @@ def find_pairs(
     basis: Basis,
     state: NewtonState,
     samples: Samples,
+    curvature: wp.array[float],  # (sample_total,), mean of the asset at rest [1/m]
     # In and out:
     pairs: Pairs,
 ):
@@ -363,7 +380,7 @@ def find_pairs(
         nearest = sample[slot]
         if j < 0:
             return
-        patch = fit_patch(instances, basis, samples, pairs, i, s, j, nearest)
+        patch = fit_patch(instances, basis, samples, curvature, pairs, i, s, j, nearest)
         gap = patch.gap - wp.float64(instances.contact_radius[i] + instances.contact_radius[j])
         reach = instances.margin[i]
         if looks_at(pairs, i, s, j, nearest):
@@ -465,8 +482,7 @@ def write_pairs(
     motion: Motion,
     samples: Samples,
     state: NewtonState,
-    relative_stiffness: wp.array[float],  # (sample_total,), Young's modulus relative to the body's
-    dent_length: wp.array[float],  # (sample_total,), see ``dents`` [m]
+    surface: Surface,
     stick_ratio: wp.float64,
     stick_partner: wp.array[wp.vec2i],  # (particle_count,), see ``friction_memory_kernels``
     stick_slip: wp.array[mat23d],  # (particle_count,) [m]
@@ -508,7 +524,7 @@ def write_pairs(
     inverse = wp.float64(1.0) / total
     # carried on to x; of the same body, the difference to it
     offset = inverse * offset - wp.max(pairs.gap[i, s, slot], wp.float64(0.0)) * pairs.normal[i, s, slot]
-    F = gradient_at(instances, basis, motion, j, nearest)
+    F = gradient_of(instances, basis, motion.q_start, j, at)
     X = wp.vec3(clamped_inverse(F, instances.scale[j]) * offset)
     for b in range(basis.row.shape[1]):
         value = float(inverse) * basis.row[row, b]
@@ -521,26 +537,40 @@ def write_pairs(
 
     # each of the two surfaces brings its samples, so that each counts one half
     half_area = wp.max(0.5 * sample_area(instances.scale[i], basis.row_area[own]), 1.0e-30)
-    ri = relative_stiffness[own]
-    rj = relative_stiffness[at]
-    stiffness = wp.float64(layers_in_series(instances, i, j, BULK_FACTOR, ri, rj, dt) * half_area)
+    ri = surface.relative_stiffness[own]
+    rj = surface.relative_stiffness[at]
+    firm_i = ri * surface.slenderness[own]
+    firm_j = rj * surface.slenderness[at]
+    stiffness = wp.float64(layers_in_series(instances, i, j, BULK_FACTOR, firm_i, firm_j, dt) * half_area)
     shear = wp.float64(layers_in_series(instances, i, j, SHEAR_FACTOR, ri, rj, dt) * half_area)
-    wi = dent_compliance(instances, i, ri, dent_length[own]) / half_area
-    wj = dent_compliance(instances, j, rj, dent_length[at]) / half_area
-    compliance = wp.float64(wi + wj)
+    n = pairs.normal[i, s, slot]
+    mine = shape_of_cell(surface, instances, basis, i, own, surface.curvature[at] / instances.scale[j])
+    F_own = gradient_of(instances, basis, motion.q_start, i, own)
+    fade = fade_of(mine, F_own, n)
+    theirs = shape_of_cell(surface, instances, basis, j, at, surface.curvature[own] / instances.scale[i])
+    spared_i = float(wp.float64(1.0) - touched_share(surface, pairs.other, pairs.gap, mine, fade, i, own, j))
+    spared_j = float(wp.float64(1.0) - touched_share(surface, pairs.other, pairs.gap, theirs, fade, j, at, i))
+    wi = wp.float64(spared_i * dent_compliance(instances, i, ri, surface.dent_length[own]) / half_area)
+    wj = wp.float64(spared_j * dent_compliance(instances, j, rj, surface.dent_length[at]) / half_area)
+    compliance = wi + wj
+    cell = cell_at(mine, F_own, n, pairs.gap[i, s, slot], wp.float64(0.0), stiffness * compliance)
+    stick = stick_ratio * shear
+    deep = stick
+    stick = stick / (wp.float64(1.0) + stick * (shear_yield(instances, i, wi) + shear_yield(instances, j, wj)))
+    pairs.share[i, s, slot] = float(wi / wp.max(compliance, wp.float64(1.0e-30)))
     thick = wp.max(instances.scale[i] * pairs.thickness[own], instances.scale[j] * pairs.thickness[at])
-    depth = dent_depth(instances, i, dent_length[own]) + dent_depth(instances, j, dent_length[at])
+    depth = spared_i * dent_depth(instances, i, surface.dent_length[own], True)
+    depth += spared_j * dent_depth(instances, j, surface.dent_length[at], True)
     depth = wp.min(depth, 0.5 * DEPTH * thick)
     friction = wp.float64(wp.sqrt(instances.friction[i] * instances.friction[j]))
-    n = pairs.normal[i, s, slot]
     deepest = -wp.float64(OVERLAP * wp.min(instances.size[i], instances.size[j]))
     if pairs.gap[i, s, slot] < deepest:
         wp.atomic_or(state.status, instances.world[i], WORLD_PENETRATION)
-    offset = wp.max(pairs.gap[i, s, slot], deepest) * n
+    offset = (wp.max(pairs.gap[i, s, slot], deepest) - cell.lead) * n
     particle = instances.particle_start[i] + s
     for before in range(SLOTS):
         if stick_partner[particle][before] == j - state.instance_start[instances.world[i]]:
-            slip = gradient_at(instances, basis, motion, i, s) * stick_slip[particle][before]
+            slip = F_own * stick_slip[particle][before]
             offset += slip - wp.dot(n, slip) * n
     pairs.held[i, s, slot] = pairs.constraint[i, k]
     for side in range(2):
@@ -562,9 +592,12 @@ def write_pairs(
             constraints.normal[a, e] = direction * n
             constraints.offset[a, e] = direction * offset
             constraints.stiffness[a, e] = stiffness
-            constraints.stick[a, e] = stick_ratio * shear
+            constraints.stick[a, e] = stick
+            constraints.stick_deep[a, e] = deep
             constraints.dent_compliance[a, e] = compliance
-            constraints.dent_depth[a, e] = wp.float64(depth)
+            constraints.dent_depth[a, e] = wp.float64(depth) + HARDENING_DEPTH * mine.least
+            constraints.onset[a, e] = cell.onset
+            constraints.lead[a, e] = cell.lead
             constraints.friction[a, e] = friction
 
 
@@ -597,11 +630,12 @@ def remember_pairs(
             continue
         limit = constraints.friction[i, e] * constraints.normal_force[i, e]
         total = constraints.slip[i, e]
-        stretch = constraints.stick[i, e] * wp.length(total)
-        if not (limit > wp.float64(0.0) and stretch > wp.float64(0.0) and wp.isfinite(stretch + limit)):
+        slid = wp.length(total)
+        most = elastic_slip(limit, constraints.stick[i, e], constraints.stick_deep[i, e], constraints.dent_depth[i, e])
+        if not (most > wp.float64(0.0) and slid > wp.float64(0.0) and wp.isfinite(slid + most)):
             continue
-        F = gradient_at(instances, basis, motion, i, s)
-        elastic = clamped_inverse(F, instances.scale[i]) * (wp.min(wp.float64(1.0), limit / stretch) * total)
+        F = gradient_of(instances, basis, motion.q_start, i, instances.row_start[i] + s)
+        elastic = clamped_inverse(F, instances.scale[i]) * (wp.min(wp.float64(1.0), most / slid) * total)
         partner[slot] = pairs.other[i, s, slot] - state.instance_start[instances.world[i]]
         slips[slot] = elastic
     particle = instances.particle_start[i] + s

@@ -11,6 +11,7 @@ from scipy.spatial import KDTree
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.contact import dent_kernels
 from softmode.deformables.contact import pair_kernels as kernels
+from softmode.deformables.contact.cell_kernels import Surface
 from softmode.deformables.model.declare import Kernel, launch, launch_teams
 from softmode.deformables.model.lane_kernels import team_size
 from softmode.deformables.model.layout import Layout
@@ -44,8 +45,7 @@ class SoftPairs:
         basis: Their bases, with the rows that contact between soft bodies writes.
         stick_ratio: Tangential over normal stiffness of a contact that sticks; 0 for friction without memory.
         spacing: Of the surface samples of each instance [m], shape (instance_count,).
-        relative_stiffness: Young's modulus at the surface samples of all bodies relative to the body's.
-        dent_length: Dents at these samples under the pressure E / (1 - nu^2) [m].
+        surface: What contact knows of the surface samples of all bodies.
         device: Where the tables lie.
     """
 
@@ -56,14 +56,13 @@ class SoftPairs:
         basis: Basis,
         stick_ratio: float,
         spacing: wp.array,
-        relative_stiffness: wp.array,
-        dent_length: wp.array,
+        surface: Surface,
         device: wp.Device,
     ) -> None:
         """Allocate the tables."""
         self.layout, self.instances, self.basis, self.device = layout, instances, basis, device
         self.stick_ratio, self.team = stick_ratio, team_size(device)
-        self.relative_stiffness, self.dent_length = relative_stiffness, dent_length
+        self.surface = surface
         sizes = {
             "instance": layout.instance_count,
             "sample": layout.sample_max,
@@ -126,13 +125,12 @@ class SoftPairs:
         pairs, instances, basis = self.table, self.instances, self.basis
         every, count, constraint_max = samples.position.shape, self.layout.instance_count, constraints.row.shape[1]
         self._launch(kernels.place_surface, every, instances, basis, motion, samples, pairs)
-        self._launch(kernels.find_pairs, every, instances, basis, state, samples, pairs)
+        self._launch(kernels.find_pairs, every, instances, basis, state, samples, self.surface.curvature, pairs)
         launch_teams(self.device, kernels.compact_pairs, count, self.team, instances, self.team, pairs, state.status)
         found = (pairs, constraints, state.status)
         self._launch(kernels.accept_pairs, self.layout.world_count, state, constraint_max, *found)
-        surface = (self.relative_stiffness, self.dent_length)
         stick = (wp.float64(self.stick_ratio), memory.stick_partner, memory.stick_slip, dt)
-        tables = (instances, basis, motion, samples, state, *surface, *stick)
+        tables = (instances, basis, motion, samples, state, self.surface, *stick)
         self._launch(kernels.write_pairs, pairs.sample.shape, *tables, pairs, constraints)
 
     def remember(self, motion: Motion, state: NewtonState, constraints: PointConstraints, memory: SoftState) -> None:
@@ -150,8 +148,7 @@ class SoftPairs:
 
     def leave_dents(self, constraints: PointConstraints, memory: SoftState) -> None:
         """Add the dents that these contacts leave to those in the state ``memory``."""
-        surface = (self.relative_stiffness, self.dent_length)
-        tables = (self.instances, *surface, self.table, constraints, memory.dent)
+        tables = (self.instances, self.table, constraints, memory.dent)
         self._launch(dent_kernels.leave_pair_dents, self.table.surface_normal.shape, *tables)
 
     def _launch(self, kernel: Kernel, dim: int | tuple[int, ...], *arguments: object) -> None:

@@ -4,8 +4,9 @@ With the displacement d of the sample relative to the shape during the step, a c
 
     E(d) = A kappa psi_n(-g0 - n . d) + psi_t(|s + d_t|; mu f_n, k_t),
 
-psi_n the C2 penalty p^3/(6 eps) for p < eps, p^2/2 - eps p/2 + eps^2/6 beyond (p the penetration), in series with the
-dent that the functions of the body cannot carry, and a stiffer one where p is large (see ``normal_potential``); s the
+psi_n the C2 penalty p^3/(6 eps) for p < eps, p^2/2 - eps p/2 + eps^2/6 beyond (p the penetration): the mean of linear
+springs over gaps that are spread evenly over eps, see ``cell_kernels``. Each is a penalty in series with the dent that
+the functions of the body cannot carry; a stiffer one comes in where p is large (see ``normal_potential``); s the
 slip that the contact remembers (see ``friction_memory_kernels``); psi_t the
 incremental potential of elastic-plastic friction, a spring k_t up to the force mu f_n and that force beyond (Cundall
 and Strack 1979, doi:10.1680/geot.1979.29.1.47), with the normal force f_n of the last Newton iterate. k_t does not
@@ -29,12 +30,12 @@ from softmode.deformables.model.struct_kernels import (
 
 wp.set_module_options({"enable_backward": False})
 
-BULK_FACTOR = wp.constant(400.0)
+BULK_FACTOR = wp.constant(150.0)
 """Contact stiffness per area over P-wave modulus per size: under a pressure that squeezes a body by 10 %, contact sinks
-by 0.025 % of its size. The dent gives way, the penalty only keeps surfaces apart."""
+by 0.067 % of its size. The dent gives way, the penalty only keeps surfaces apart."""
 SHEAR_FACTOR = wp.constant(40.0)
-"""The same of the spring of friction, which no dent softens: with 400 stiff bodies that hit the ground hop between
-sticking and sliding (40 iterations instead of 11 at 1e9 Pa)."""
+"""The same of the spring of friction: with 400 stiff bodies that hit the ground hop between sticking and sliding (40
+iterations instead of 11 at 1e9 Pa)."""
 INERTIA_FACTOR = wp.constant(100.0)
 """Contact stiffness over effective mass / dt^2, per area: what hits flat is stopped within a step, v dt / 100 deep. 0
 sinks 1.5 to 3 mm at 5 m/s instead of 0.2 to 0.9; 1000 sinks 0.2 mm for a third more iterations."""
@@ -44,7 +45,12 @@ HARDENING = wp.constant(wp.float64(9.0))
 """Stiffness that contact gains where it is deep, over that where it is not: what an arm presses with its full force
 sinks in 1.4 to 2.4 mm instead of 7 to 8. Ten times the stiffness throughout costs light bodies momentum."""
 HARDENING_DEPTH = wp.constant(wp.float64(2.0))
-"""Penetration beyond which it does, in ranges of the onset."""
+"""Penetration beyond which it does besides the dent, in ranges of the onset of a level face."""
+ALONG = wp.constant(wp.float64(0.1))
+"""Largest dent along the surface over that across it. What rolls needs 0.05 mm of it. Without a bound a soft body that
+fingers pinch at few samples gets out from between them: contact there hardens across, and must along."""
+HARDENING_RANGE = wp.constant(wp.float64(2.0))
+"""Range of the onset of what it gains, in ranges of the contact's onset."""
 
 
 @wp.func
@@ -59,34 +65,11 @@ def penalty(penetration: wp.float64, eps: wp.float64):
 
 
 @wp.func
-def dented_penalty(penetration: wp.float64, eps: wp.float64, ratio: wp.float64):
-    """Return the penalty in series with a spring of 1 / ratio of its stiffness, and its first two derivatives.
-
-    min_x penalty(x) + (p - x)^2 / (2 ratio), x what is left of a penetration p besides the dent p - x. It is as convex
-    and as smooth as the penalty. The root of x + ratio penalty'(x) = p is that of a quadratic where x < eps and linear
-    beyond, so it is exact.
-    """
-    zero = wp.float64(0.0)
-    half = wp.float64(0.5)
-    one = wp.float64(1.0)
-    two = wp.float64(2.0)
-    p = wp.max(penetration, zero)
-    x = p
-    if ratio > zero:
-        if p < eps * (one + half * ratio):
-            x = two * p / (one + wp.sqrt(one + two * ratio * p / eps))
-        else:
-            x = (p + half * ratio * eps) / (one + ratio)
-    psi, slope, curvature = penalty(x, eps)
-    return psi + half * ratio * slope * slope, slope, curvature / (one + ratio * curvature)
-
-
-@wp.func
 def normal_potential(penetration: wp.float64, eps: wp.float64, ratio: wp.float64, depth: wp.float64):
     """Return the contact potential of a penetration [m] per unit stiffness, and its first two derivatives.
 
-    The C2 penalty in series with the dent, and a stiffer penalty that sets in twice as deep and as slowly, ``depth``
-    deeper where there is a dent.
+    The C2 penalty of springs in series with the dent, 1 / (1 + ratio) as stiff, and a stiffer penalty that sets in
+    twice as deep and as slowly, ``depth`` deeper where there is a dent.
 
     Args:
         penetration: p [m].
@@ -94,17 +77,21 @@ def normal_potential(penetration: wp.float64, eps: wp.float64, ratio: wp.float64
         ratio: Compliance of the dent over that of the penalty; 0 for none.
         depth: Dent [m] from which on the stiffer penalty carries.
     """
-    psi, slope, curvature = dented_penalty(penetration, eps, ratio)
-    deep = HARDENING_DEPTH * eps
-    psi_deep, slope_deep, curvature_deep = penalty(penetration - depth - deep, deep)
-    return psi + HARDENING * psi_deep, slope + HARDENING * slope_deep, curvature + HARDENING * curvature_deep
+    share = wp.float64(1.0) / (wp.float64(1.0) + ratio)
+    psi, slope, curvature = penalty(penetration, eps)
+    psi_deep, slope_deep, curvature_deep = penalty(penetration - depth, HARDENING_RANGE * eps)
+    return (
+        share * psi + HARDENING * psi_deep,
+        share * slope + HARDENING * slope_deep,
+        share * curvature + HARDENING * curvature_deep,
+    )
 
 
 @wp.func
-def contact_potential(constraints: PointConstraints, smoothing: float, penetration: wp.float64, i: int, e: int):
+def contact_potential(constraints: PointConstraints, penetration: wp.float64, i: int, e: int):
     """Return the potential of a contact at a penetration [m] per unit stiffness, and its first two derivatives."""
     ratio = constraints.stiffness[i, e] * constraints.dent_compliance[i, e]
-    return normal_potential(penetration, wp.float64(smoothing), ratio, constraints.dent_depth[i, e])
+    return normal_potential(penetration, constraints.onset[i, e], ratio, constraints.dent_depth[i, e])
 
 
 @wp.func
@@ -123,25 +110,50 @@ def friction_potential(y: wp.float64, eps: wp.float64):
 
 
 @wp.func
-def stick_potential(y: wp.float64, limit: wp.float64, stiffness: wp.float64):
+def elastic_slip(force: wp.float64, stiffness: wp.float64, deep: wp.float64, depth: wp.float64):
+    """Return the slip [m] at which the spring of friction has a force [N]; 0 of friction without memory."""
+    if stiffness <= wp.float64(0.0):
+        return wp.float64(0.0)
+    most = ALONG * depth
+    if force <= stiffness * most:
+        return force / stiffness
+    return most + (force - stiffness * most) / deep
+
+
+@wp.func
+def stick_potential(y: wp.float64, limit: wp.float64, stiffness: wp.float64, deep: wp.float64, depth: wp.float64):
     """Return energy [J], force over slip and curvature along the slip [N/m] of elastic-plastic friction at slip y [m].
 
-    A spring up to the force ``limit`` [N], constant force beyond; nothing where the limit is 0.
+    A spring up to the force ``limit`` [N], constant force beyond; nothing where the limit is 0. It has the stiffness
+    ``deep`` from ALONG times the dent ``depth`` [m] on.
     """
     zero = wp.float64(0.0)
     half = wp.float64(0.5)
     if limit <= zero:
         return zero, zero, zero
-    if stiffness * y <= limit:
-        return half * stiffness * y * y, stiffness, stiffness
-    return limit * (y - half * limit / stiffness), limit / y, zero
+    most = elastic_slip(limit, stiffness, deep, depth)
+    x = wp.min(y, most)
+    over = wp.max(x - ALONG * depth, zero)
+    energy = half * stiffness * x * x + half * (deep - stiffness) * over * over + limit * (y - x)
+    if y > most:
+        return energy, limit / y, zero
+    if over > zero:
+        return energy, stiffness + (deep - stiffness) * over / y, deep
+    return energy, stiffness, stiffness
 
 
 @wp.func
-def slip_potential(y: wp.float64, limit: wp.float64, stick: wp.float64, stick_range: wp.float64):
+def slip_potential(
+    y: wp.float64,
+    limit: wp.float64,
+    stick: wp.float64,
+    deep: wp.float64,
+    depth: wp.float64,
+    stick_range: wp.float64,
+):
     """Return energy [J], force over slip and curvature along the slip [N/m] of friction, with memory or smoothed."""
     if stick > wp.float64(0.0):
-        return stick_potential(y, limit, stick)
+        return stick_potential(y, limit, stick, deep, depth)
     f0, secant, tangent = friction_potential(y, stick_range)
     return limit * f0, limit * secant, limit * tangent
 
@@ -205,21 +217,34 @@ def stiffness_exponents(instances: Instances, i: int, factor: float, relative: f
 
 
 @wp.func
-def dent_depth(instances: Instances, i: int, length: float):
+def dent_depth(instances: Instances, i: int, length: float, edged: bool):
     """Return the dent [m] beyond which the contact of a body hardens.
 
-    It is what the pressure E / (2 - 2 nu^2) dents, E that where it is touched, and a quarter of the overlap that a step
-    may start from at the most: deeper, samples at an edge of what presses would take one face for the other in turns.
+    It is what the pressure E / (2 - 2 nu^2) dents, E that where it is touched. Where what presses has edges, three
+    tenths of the overlap that a step may start from at the most: deeper, samples at an edge would take one face for the
+    other in turns.
     Zero where ``contact_stiffness`` is given: the penalty is then the whole law of the contact.
 
     Args:
         instances: The bodies.
         i: The body.
         length: Dent at scale 1 under the pressure E / (1 - nu^2) [m], see ``dents``.
+        edged: Whether what presses has edges.
     """
     if instances.contact_stiffness[i] > 0.0:
         return float(0.0)
-    return wp.min(0.5 * instances.scale[i] * length, 0.25 * OVERLAP * instances.size[i])
+    depth = 0.5 * instances.scale[i] * length
+    if edged:
+        depth = wp.min(depth, 0.3 * OVERLAP * instances.size[i])
+    return depth
+
+
+@wp.func
+def shear_yield(instances: Instances, i: int, compliance: wp.float64):
+    """Return the compliance along the surface [m/N] of a dent of some compliance across it: Mindlin's ratio."""
+    nu = wp.float64(instances.poissons_ratio[i])
+    two = wp.float64(2.0)
+    return compliance * (two - nu) / (two - two * nu)
 
 
 @wp.func
@@ -244,6 +269,15 @@ def dent_exponents(instances: Instances, i: int):
     one = wp.float64(1.0)
     nu = wp.float64(instances.poissons_ratio[i])
     return wp.vec4d(-one, wp.float64(-2.0) * nu / (one - nu * nu), wp.float64(0.0), -one)
+
+
+@wp.func
+def shear_exponents(instances: Instances, i: int):
+    """Return d ln of the compliance of a dent along the surface over that across, by the same."""
+    zero = wp.float64(0.0)
+    one = wp.float64(1.0)
+    nu = wp.float64(instances.poissons_ratio[i])
+    return wp.vec4d(zero, one / (one - nu) - one / (wp.float64(2.0) - nu), zero, zero)
 
 
 @wp.kernel

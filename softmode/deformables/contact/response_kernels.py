@@ -38,6 +38,7 @@ def contact_response(
     depth: wp.float64,
     friction: wp.float64,
     stick: wp.float64,
+    deep: wp.float64,
     held: wp.float64,
     eps: wp.float64,
     stick_range: wp.float64,
@@ -56,6 +57,7 @@ def contact_response(
         depth: Dent [m] from which on the contact hardens.
         friction: Coefficient of friction.
         stick: Stiffness of the spring of friction [N/m]; 0 for friction without memory.
+        deep: The same where the dent along the surface is used up [N/m].
         held: Normal force that friction went by [N].
         eps: Range of the onset [m].
         stick_range: That of friction without memory [m].
@@ -79,11 +81,12 @@ def contact_response(
     # offset = gap n + memory - drift of the shape: the tangential part is the slip
     t = total - gap * n
     y = wp.length(t)
-    energy, secant, tangent = slip_potential(y, friction * pressed, stick, stick_range)
+    energy, secant, tangent = slip_potential(y, friction * pressed, stick, deep, depth, stick_range)
     # the energy is concave in y^2, so the quadratic of the secant's curvature lies above it and its steps cannot
-    # overshoot, from however far away; the potential's own curvature along the slip converges faster once it is close
+    # overshoot, from however far away; the potential's own curvature along the slip converges faster once it is close,
+    # and is the larger where the dent along the surface is used up
     N = wp.outer(n, n)
     H = stiffness * curvature * N + secant * (identity - N)
-    if exact != 0 and y > wp.float64(1.0e-9) * stick_range:
+    if (exact != 0 or tangent > secant) and y > wp.float64(1.0e-9) * stick_range:
         H += (tangent - secant) / (y * y) * wp.outer(t, t)
     return stiffness * psi + energy, stiffness * slope * n - secant * t, H, pressed, t

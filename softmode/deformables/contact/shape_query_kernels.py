@@ -20,6 +20,8 @@ _BOX = int(GeoType.BOX)
 _MESH = int(GeoType.MESH)
 _CONE = int(GeoType.CONE)
 _CONVEX_MESH = int(GeoType.CONVEX_MESH)
+SMOOTH = sum(1 << kind for kind in (PLANE, HEIGHTFIELD, _SPHERE, _CAPSULE, _ELLIPSOID))
+"""Bits of the kinds of shapes without edges."""
 
 SUPPORTED_SHAPES = (PLANE, HEIGHTFIELD, _SPHERE, _CAPSULE, _ELLIPSOID, _CYLINDER, _BOX, _MESH, _CONE, _CONVEX_MESH)
 """Shape types a soft body can touch."""

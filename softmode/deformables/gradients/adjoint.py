@@ -23,7 +23,9 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from softmode.checks import require_fields, require_number
+from softmode.deformables.contact.detection_kernels import place_samples
 from softmode.deformables.gradients import adjoint_kernels as kernels
+from softmode.deformables.gradients import cell_adjoint_kernels as cell_kernels
 from softmode.deformables.gradients import spin_adjoint_kernels as spin_kernels
 from softmode.deformables.gradients.krylov import Gmres
 from softmode.deformables.gradients.turning_kernels import find_turning
@@ -43,7 +45,8 @@ from softmode.errors import ConfigError, SolverDiverged
 
 Array = NDArray[np.float64]
 
-_CONSTRAINT = ("row", "shape", "normal", "offset", "stiffness", "dent_compliance", "dent_depth", "friction", "stick")
+_CONSTRAINT = ("row", "partner_row", "shape", "normal", "offset", "stiffness", "dent_compliance", "dent_depth", "onset")
+_CONSTRAINT += ("friction", "stick", "stick_deep")
 """What a step's point constraints are made of, besides their count: members of the solver's ``PointConstraints``."""
 FLAT = 0.02
 """Turn of a normal [rad] over the size of a body up to which a shape counts as flat: what float32 leaves of a plane."""
@@ -127,14 +130,15 @@ class AdjointReduced:
 
     Differentiated: elasticity, viscosity, inertia and mass damping, gravity, external forces, pins and driven functions
     (exactly); contact with flat faces: its stiffness, which follows E, nu, mass and size, its friction with the normal
-    force, and what friction remembers. Not differentiated: the turning of contact normals with the point of contact
+    force, what friction remembers, and what the cells of its samples and what touches around them take from the start
+    of the step. Not differentiated: the turning of contact normals with the point of contact
     (refused unless ``fixed_normals`` is set), contacts appearing or vanishing at the end of their detection range
     (where they carry no force), the motion of rigid shapes, and what BDF2 remembers from before the record. Parameters
     must not change between recording and ``backward``.
 
     Args:
         solver: The solver; rigid dofs must not take part in its solve.
-        step_max: Steps that can be recorded. A step keeps four vec3d per function, and 80 bytes per pin and, with
+        step_max: Steps that can be recorded. A step keeps four vec3d per function, and 112 bytes per pin and, with
             shapes in the model, per contact slot; ``backward`` takes as much again.
         options: Tolerances.
 
@@ -185,17 +189,23 @@ class AdjointReduced:
         kinds = {name: getattr(t.constraints, name).dtype for name in _CONSTRAINT}
         self._constraint = {name: self._zeros((step_max, *constraints), kind) for name, kind in kinds.items()}
 
+        samples, touched = (step_max, *t.samples.shape.shape), self.solver.model.shape_count > 0
+        kinds = {"shape": int, "gap": wp.float64} if touched else {}
+        self._sample = {name: self._zeros(samples, kind) for name, kind in kinds.items()}
+
         self._sizes = {
             "instance": self.instances,
             "point": layout.point_max,
+            "sample": layout.sample_max,
             "constraint": self.constraint_max,
             "pin": self.pin_total,
             "unknown": 3 * layout.block_count,
         }
         of_constraints = (
-            "constraint_slip constraint_normal constraint_gain constraint_hessian constraint memory memory_start"
+            "constraint_slip constraint_normal constraint_gain constraint_hessian constraint memory memory_start "
+            "contact_bar normal_bar cell_gradient cell_place cell_spared"
         )
-        axes = {"": "instance point", of_constraints: "instance constraint"}
+        axes = {"": "instance point", of_constraints: "instance constraint", "sample_place": "instance sample"}
         self._step = allocate(kernels.Linearised, axes, self._sizes, self.device)
         points, constraints = Points(), PointConstraints()
         points.stress, constraints.force = self._step.point, self._step.constraint
@@ -293,6 +303,8 @@ class AdjointReduced:
         """Return pairs of what is stored of the point constraints of step t and where the solver has it."""
         constraints, width = self.tables.constraints, self.constraint_max
         pairs = [(self._constraint_count[t], constraints.count)]
+        if self.solver.model.shape_count:
+            pairs += [(stored[t], getattr(self.tables.samples, name)) for name, stored in self._sample.items()]
         if width:
             pairs += [(stored[t], getattr(constraints, name)[:, :width]) for name, stored in self._constraint.items()]
         return pairs
@@ -351,7 +363,7 @@ class AdjointReduced:
             wp.copy(error[k], self._gmres.error)
             t.launch(kernels.accumulate_points, points, *bodies, costate, dt, sums, self._step)
             if self.constraint_max:
-                contacts = (t.shapes, t.constraints, t.surface_stiffness, costate, self.dt[k])
+                contacts = (t.shapes, t.constraints, t.surface, costate, self.dt[k])
                 found = (sums, pin_target[k], self._step)
                 t.launch(kernels.accumulate_constraints, constraints, *bodies, *contacts, *found)
             self._sum_points(t.newton.active)
@@ -359,6 +371,8 @@ class AdjointReduced:
             t.launch(kernels.propagate, t.unknowns, *bodies, *given, q_bar, qd_bar, sums)
             start = (t.motion, self._spin, t.spin, t.arrays.q, costate, dt, k)
             t.launch(spin_kernels.propagate_spin, self.instances, *bodies, *start, q_bar, qd_bar)
+            if self.solver.model.shape_count:
+                self._pull_cells(k, costate, sums, q_bar[k + 1], qd_bar[k + 1])
 
         self._check(residual.numpy(), error.numpy(), overlap.numpy())
         density = self.solver.parameters.density
@@ -426,6 +440,9 @@ class AdjointReduced:
         for stored, values in self._constraints(k):
             wp.copy(values, stored)
         t.shapes.body_q, t.shapes.body_qd = self._pose[k], self._twist[k]
+        if self.solver.model.shape_count:
+            t.launch(place_samples, t.samples.position.shape, t.instances, t.basis, t.motion, t.samples)
+            t.launch(cell_kernels.restore_rows, self._dims[1], *self._cells, t.constraints, dt)
         adapt(t, dt)
         t.launch_teams(end_spin, self.instances, t.newton_step(dt), t.team, t.spin)
         progress = t.newton
@@ -454,9 +471,24 @@ class AdjointReduced:
     def _pull_memory(self, k: int, q_bar: wp.array) -> None:
         """Add what the step after k feels of where its contacts stick to dL/dq_t."""
         t, constraints = self.tables, self._dims[1]
-        after = (self._constraint_count[k + 1], self._constraint["row"][k + 1], self._constraint["shape"][k + 1])
+        after = (self._constraint_count[k + 1], *(self._constraint[name][k + 1] for name in ("partner_row", "shape")))
         t.launch(kernels.pull_memory, constraints, t.instances, t.shapes, t.constraints, *after, self._step)
         t.launch(kernels.add_memory, t.unknowns, t.instances, t.basis, t.constraints, self._step, q_bar)
+
+    def _pull_cells(self, k: int, costate: wp.array, sums: Any, q_bar: wp.array, qd_bar: wp.array) -> None:
+        """Add what the cells of step k's contacts, and what touches around them, feel of its start."""
+        t, dt, constraints = self.tables, self.dt[k], self._dims[1]
+        given = (*self._cells, t.constraints, t.arrays.q, costate, dt)
+        t.launch(cell_kernels.accumulate_cells, constraints, *given, sums, self._step)
+        t.launch(cell_kernels.spread_over_neighbours, self.instances, *self._cells, t.constraints, dt, self._step)
+        found = (t.instances, t.basis, t.constraints, self._step, wp.float64(dt))
+        t.launch(cell_kernels.propagate_cells, t.unknowns, *found, q_bar, qd_bar)
+
+    @property
+    def _cells(self) -> tuple[Any, ...]:
+        """What contact takes cells from."""
+        t = self.tables
+        return t.instances, t.basis, t.motion, t.shapes, t.samples, t.surface
 
     def _solve(self, k: int, right: wp.array, solution: wp.array) -> None:
         """Solve H_t^T solution = right at the free functions; leave H_t^T solution at the driven ones."""

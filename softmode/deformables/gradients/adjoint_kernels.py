@@ -6,14 +6,19 @@ linear system: contact couples a body with rigid shapes only. Every sum runs in 
 
 import warp as wp
 
+from softmode.deformables.contact.cell_kernels import Surface
 from softmode.deformables.contact.detection_kernels import Shapes, shape_area, shape_frame
 from softmode.deformables.contact.penalty_kernels import (
+    ALONG,
     BULK_FACTOR,
     SHEAR_FACTOR,
     contact_potential,
     dent_exponents,
-    dented_penalty,
+    elastic_slip,
     friction_potential,
+    penalty,
+    shear_exponents,
+    shear_yield,
     slip_potential,
     stiffness_exponents,
 )
@@ -47,13 +52,19 @@ class Linearised:
     point: wp.array2d[wp.mat33d]  # V times what is summed over the points next [N m]
     constraint_slip: wp.array2d[wp.vec3d]  # pins: x - target [m]; contacts: -d force / d friction coefficient [N]
     constraint_normal: wp.array2d[wp.vec3d]  # contacts: d force / d normal force
-    constraint_gain: wp.array2d[wp.vec3d]  # contacts: d normal force / d ln of stiffness, dent compliance, lengths [N]
+    constraint_gain: wp.array2d[wp.vec2d]  # contacts: d normal force / d ln of stiffness, dent compliance [N]
     constraint_hessian: wp.array2d[wp.mat33d]  # -d force / d displacement [N/m]; not symmetric where a contact slips
     constraint: wp.array2d[wp.vec3d]  # what is summed over the constraints next [N]
     memory: wp.array2d[wp.vec3d]  # what the next step feels of a contact's memory, over the stick stiffness
     memory_start: wp.array2d[
         wp.vec3d
     ]  # the loss by the memory that a contact begins the step with, shape's frame [1/m]
+    contact_bar: wp.array2d[wp.vec3d]  # the loss by a contact's displacement [1/m], and
+    normal_bar: wp.array2d[wp.vec3d]  # by its normal force, by ln of its dent's compliance and of its depth besides
+    cell_gradient: wp.array2d[wp.mat33d]  # the loss by the gradient of a cell ahead, and
+    cell_place: wp.array2d[wp.vec3d]  # by the sample's place ahead [1/m]
+    cell_spared: wp.array2d[wp.float64]  # by the share of the neighbourhood that does not touch
+    sample_place: wp.array2d[wp.vec3d]  # (instance_count, sample_max), the loss by its place at the start [1/m]
 
 
 @struct
@@ -184,7 +195,7 @@ def place_constraints(
 
     With x = offset + d, p = -n . x and t the tangential part of x, a contact's force is
     f = k psi_n'(p) n - secant(|t|, c k psi_n'(p)) t, see ``penalty_kernels``. psi_n' depends on the ratio r of the
-    dent's compliance to the penalty's by r dpsi_n'/dr = -r g' g, g the slope of the dented penalty.
+    dent's compliance to the penalty's by r dpsi_n'/dr = -r g / (1 + r)^2, g the slope of the penalty.
     """
     i, e = wp.tid()
     if e >= constraints.count[i]:
@@ -199,20 +210,20 @@ def place_constraints(
         return
     n = constraints.normal[i, e]
     p = -wp.dot(n, x)
-    eps = wp.float64(instances.smoothing[i])
     ratio = k * constraints.dent_compliance[i, e]
-    _psi, slope, curvature = contact_potential(constraints, instances.smoothing[i], p, i, e)
-    _dented, dent_slope, dent_curvature = dented_penalty(p, eps, ratio)
+    _psi, slope, curvature = contact_potential(constraints, p, i, e)
+    _penalty, plain_slope, _curvature = penalty(p, constraints.onset[i, e])
     t = x + p * n
     y = wp.length(t)
     c = constraints.friction[i, e]
     stick = constraints.stick[i, e]
     limit = c * k * slope
-    _energy, secant, tangent = slip_potential(y, limit, stick, stick_range)
+    deep = constraints.stick_deep[i, e]
+    _energy, secant, tangent = slip_potential(y, limit, stick, deep, constraints.dent_depth[i, e], stick_range)
     _f0, by_limit, _f1_slope = friction_potential(y, stick_range)
     if stick > wp.float64(0.0):
         by_limit = wp.float64(0.0)
-        if stick * y > limit:
+        if tangent == wp.float64(0.0) and y > wp.float64(0.0):
             by_limit = wp.float64(1.0) / y
     N = wp.outer(n, n)
     slip = secant * (identity - N)
@@ -220,10 +231,15 @@ def place_constraints(
         slip += (tangent - secant) / (y * y) * wp.outer(t, t)
     step.constraint_slip[i, e] = k * slope * by_limit * t
     step.constraint_normal[i, e] = n - c * by_limit * t
-    # psi_n' is of degree one in p and in the ranges, which grow with s
-    by_ratio = -ratio * dent_curvature * dent_slope
-    step.constraint_gain[i, e] = k * wp.vec3d(slope + by_ratio, by_ratio, slope - p * curvature)
+    by_ratio = -ratio / ((wp.float64(1.0) + ratio) * (wp.float64(1.0) + ratio)) * plain_slope
+    step.constraint_gain[i, e] = k * wp.vec2d(slope + by_ratio, by_ratio)
     step.constraint_hessian[i, e] = k * curvature * N + slip - c * k * curvature * by_limit * wp.outer(t, n)
+
+
+@wp.func
+def soft_force(constraints: PointConstraints, i: int, e: int):
+    """Return the force [N] from which on the dent along the surface is used up."""
+    return constraints.stick[i, e] * ALONG * constraints.dent_depth[i, e]
 
 
 @wp.kernel
@@ -232,14 +248,15 @@ def pull_memory(
     shapes: Shapes,
     constraints: PointConstraints,
     next_count: wp.array[int],  # (instance_count,), point constraints of the next step, and which they are
-    next_row: wp.array2d[int],
+    next_sample: wp.array2d[int],
     next_shape: wp.array2d[int],
     # In: memory_start of the next step. Out: memory of this one; constraint, what it pulls at the end of the step
     step: Linearised,
 ):
     """Take over what the next step feels of where the contacts stick.
 
-    A contact ends the step with the elastic slip -P f / k_t, P f the tangential force, whether it sticks or slides.
+    A contact ends the step with the elastic slip -y(|P f|) P f / |P f|, P f the tangential force and y
+    ``elastic_slip``, whether it sticks or slides.
     """
     i, e = wp.tid()
     if e >= constraints.count[i]:
@@ -250,9 +267,16 @@ def pull_memory(
         _origin, rotation = shape_frame(shapes, shape)
         n = constraints.normal[i, e]
         for k in range(instances.pin_count[i], next_count[i]):
-            if next_row[i, k] == constraints.row[i, e] and next_shape[i, k] == shape:
+            if next_sample[i, k] == constraints.partner_row[i, e] and next_shape[i, k] == shape:
                 g = wp.quat_rotate(rotation, step.memory_start[i, k])
                 memory = (g - wp.dot(n, g) * n) / constraints.stick[i, e]
+                force = constraints.force[i, e] - wp.dot(n, constraints.force[i, e]) * n
+                f = wp.length(force)
+                if f > soft_force(constraints, i, e):
+                    deep = constraints.stick_deep[i, e]
+                    slip = elastic_slip(f, constraints.stick[i, e], deep, constraints.dent_depth[i, e])
+                    memory *= constraints.stick[i, e] * slip / f
+                    memory += (wp.float64(1.0) / deep - slip / f) * wp.dot(g, force) / (f * f) * force
     step.memory[i, e] = memory
     step.constraint[i, e] = wp.transpose(step.constraint_hessian[i, e]) * memory
 
@@ -467,13 +491,23 @@ def accumulate_points(
     step.point[i, p] = -V * material.viscosity / dt * (F_start * hooke_stress(material, strain))
 
 
+@wp.func
+def turned_back(shapes: Shapes, shape: int, back: wp.vec3d, dt: float):
+    """Return (R - I)^T back of a shape that turns by R within the step: its drift grows so with the place."""
+    body = shapes.body[shape]
+    if body < 0:
+        return wp.vec3d()
+    spin = wp.float64(dt) * wp.vec3d(wp.spatial_bottom(shapes.body_qd[body]))
+    return wp.quat_rotate_inv(wp.quat_from_axis_angle(wp.normalize(spin), wp.length(spin)), back) - back
+
+
 @wp.kernel
 def accumulate_constraints(
     instances: Instances,
     basis: Basis,
     shapes: Shapes,
     constraints: PointConstraints,
-    relative_stiffness: wp.array[float],  # (sample_total,), Young's modulus relative to the body's
+    surface: Surface,
     costate: wp.array2d[vec8d],
     dt: float,
     # In and out:
@@ -497,35 +531,50 @@ def accumulate_constraints(
     # by ln E, nu, ln m and ln s: of the penalty, of k_t, and of the dent
     shape = constraints.shape[i, e]
     none = wp.float64(0.0)
-    relative = relative_stiffness[row]
+    sample = constraints.partner_row[i, e]
+    relative = surface.relative_stiffness[sample]
     partner_area = shape_area(shapes, shape)
-    stiffness_powers = stiffness_exponents(instances, i, BULK_FACTOR, relative, partner_area, dt)
-    shear_powers = stiffness_exponents(instances, i, SHEAR_FACTOR, relative, partner_area, dt)
+    firm = relative * surface.slenderness[sample]
+    stiffness_powers = stiffness_exponents(instances, i, BULK_FACTOR, firm, partner_area, dt)
     dent_powers = dent_exponents(instances, i)
     by = step.constraint_gain[i, e]
-    normal_gain = by[0] * stiffness_powers + by[1] * dent_powers + wp.vec4d(none, none, none, by[2])
-    # what a contact remembers is its tangential force over k_t; the force of one that sticks is k_t times its slip
+    normal_gain = by[0] * stiffness_powers + by[1] * dent_powers
+    # k_t is that of the spring of friction and of the dent along the surface in series
+    yields = constraints.stick[i, e] * shear_yield(instances, i, constraints.dent_compliance[i, e])
+    deep_powers = stiffness_exponents(instances, i, SHEAR_FACTOR, relative, partner_area, dt)
+    shear_powers = deep_powers - yields * (deep_powers + dent_powers + shear_exponents(instances, i))
+    # what a contact remembers is its elastic slip under the tangential force; that of one that sticks is by its slip
     force = constraints.force[i, e]
     along = force - wp.dot(constraints.normal[i, e], force) * constraints.normal[i, e]
     limit = constraints.friction[i, e] * wp.length(force - along)
-    stuck = constraints.stick[i, e] > none and constraints.stick[i, e] * wp.length(constraints.slip[i, e]) <= limit
-    gain = wp.dot(step.memory[i, e], along) * shear_powers
+    stick = constraints.stick[i, e]
+    deep = constraints.stick_deep[i, e]
+    depth = constraints.dent_depth[i, e]
+    felt = step.memory[i, e]
     L -= step.memory[i, e]
-    gain += wp.dot(L, step.constraint_normal[i, e]) * normal_gain
-    if stuck:
-        gain += wp.dot(L, along) * shear_powers
-    sums.contact[i, e] = sums.contact[i, e] + gain
+    if stick > none and wp.length(constraints.slip[i, e]) <= elastic_slip(limit, stick, deep, depth):
+        felt = felt + L
+    by_normal = wp.dot(L, step.constraint_normal[i, e])
+    by_shear = wp.dot(felt, along)
+    by_deep = none
+    by_depth = none
+    soft = soft_force(constraints, i, e)
+    if stick > none and wp.length(along) > soft:
+        share = soft / wp.length(along)
+        by_deep = (wp.float64(1.0) - share) * by_shear
+        by_shear *= share
+        by_depth = (wp.float64(1.0) - deep / stick) * by_shear
+    sums.contact[i, e] = sums.contact[i, e] + by_normal * normal_gain + by_shear * shear_powers + by_deep * deep_powers
+    step.normal_bar[i, e] = wp.vec3d(by_normal, by_normal * by[1] - by_shear * yields, by_depth)
     # of x = gap n + slip - drift + d, the gap grows along n as the sample's place at the start does, d falls by as much
     # as that, and the drift of a shape that turns by R within the step grows by R - I of it
     n = constraints.normal[i, e]
     back = wp.transpose(step.constraint_hessian[i, e]) * L
+    step.contact_bar[i, e] = back
     across = back - wp.dot(n, back) * n
     _origin, rotation = shape_frame(shapes, shape)
     step.memory_start[i, e] = -wp.quat_rotate_inv(rotation, across)
-    body = shapes.body[shape]
-    if body >= 0:
-        spin = wp.float64(dt) * wp.vec3d(wp.spatial_bottom(shapes.body_qd[body]))
-        across += wp.quat_rotate_inv(wp.quat_from_axis_angle(wp.normalize(spin), wp.length(spin)), back) - back
+    across += turned_back(shapes, shape, back, dt)
     step.constraint[i, e] = across
     # c = sqrt(friction of body * friction of shape)
     if instances.friction[i] > 0.0:

@@ -30,7 +30,7 @@ def find_turning(
     if kind == PLANE or wp.length_sq(constraints.force[i, e]) == wp.float64(0.0):
         return
     origin, rotation = shape_frame(shapes, shape)
-    s = constraints.row[i, e] - instances.row_start[i]
+    s = constraints.partner_row[i, e] - instances.row_start[i]
     x = wp.vec3(wp.quat_rotate_inv(rotation, samples.position[i, s] - origin))
     n = wp.vec3(wp.quat_rotate_inv(rotation, constraints.normal[i, e]))
     across = wp.vec3()

@@ -157,10 +157,11 @@ def lay_out_instances(model: newton.Model, layout: Layout) -> Instances:
     return allocate(Instances, "instance", {"instance": len(asset)}, model.device, given=given)
 
 
-def lay_out_bases(model: newton.Model, layout: Layout) -> Basis:
+def lay_out_bases(model: newton.Model, layout: Layout, contact_max: int) -> Basis:
     """Concatenate the bases of all bodies, padded to whole blocks of eight functions.
 
-    Behind the rows of samples and pins are those that contact between soft bodies writes.
+    Behind the rows of samples and pins are those that contact writes: at centres of pressure on shapes, ``contact_max``
+    for each instance, then those of soft bodies that are touched.
     """
     bodies, stride, device = layout.bodies, LANES * layout.block_count, model.device
 
@@ -178,7 +179,8 @@ def lay_out_bases(model: newton.Model, layout: Layout) -> Basis:
         return values.reshape(len(values), -1, LANES)
 
     pin_rows, pin_points = _pins(model, layout, stride)
-    dynamic = np.zeros((layout.instance_count * layout.pair_max, stride))
+    contact_rows = layout.instance_count * contact_max
+    dynamic = np.zeros((contact_rows + layout.instance_count * layout.pair_max, stride))
     linear = np.zeros((len(bodies), stride, 4))
     for a, body in enumerate(bodies):
         linear[a, : body.function_count] = body.linear_coordinates
@@ -195,17 +197,16 @@ def lay_out_bases(model: newton.Model, layout: Layout) -> Basis:
         "mean": blocks(padded([body.mean_basis[None] for body in bodies])),
         "linear": linear,
         "row": blocks(np.concatenate([padded([body.surface.basis for body in bodies]), pin_rows, dynamic])),
-        "row_point": np.concatenate([joined("surface.points"), pin_points]),
+        "row_point": np.concatenate([joined("surface.points"), pin_points, np.zeros((contact_rows, 3))]),
         "row_area": np.append(joined("surface.areas"), np.zeros(len(pin_points))),
         "inner_row": blocks(padded(inner_rows)),
         "inner_point": np.concatenate(inner),
+        "row_normal": joined("surface.normals"),
+        "row_gradient": across(padded([body.evaluate(body.surface.points)[1] for body in bodies])),
     }
     if device.is_cuda:
         given["gradient_across"] = gradient.transpose(1, 2, 0, 3)
-    if layout.pair_max:
-        given["row_normal"] = joined("surface.normals")
-        given["row_gradient"] = across(padded([body.evaluate(body.surface.points)[1] for body in bodies]))
-    basis = allocate(Basis, {"": "1", "row_gradient gradient_across": "1 1 1"}, {}, device, given=given)
+    basis = allocate(Basis, {"gradient_across": "1 1 1"}, {}, device, given=given)
     basis.gradient_across = basis.gradient_across.transpose((2, 0, 1)) if device.is_cuda else basis.gradient
     return basis
 

@@ -34,11 +34,11 @@ class Basis:
     stiffness_scale: wp.array[float]  # (point_total,)
     mean: wp.array2d[vec8d]  # (asset_count, block_count)
     linear: wp.array2d[wp.vec4d]  # (asset_count, stride), c with sum_k b_k c_k = (X, Y, Z, 1)
-    row: wp.array2d[vec8]  # (row_total, block_count): surface samples of all bodies, then pins, then dynamic rows
-    row_point: wp.array[wp.vec3d]  # (row_total,) [m]
-    row_area: wp.array[float]  # (row_total,) [m^2]
-    row_normal: wp.array[wp.vec3]  # (sample_total,), outward at rest; only where soft bodies may touch each other
-    row_gradient: wp.array3d[vec8]  # (block_count, sample_total, 3) [1/m], likewise
+    row: wp.array2d[vec8]  # (row_total, block_count): samples of all bodies, pins, dynamic rows of shapes, of pairs
+    row_point: wp.array[wp.vec3d]  # (row_total,), less those of pairs [m]
+    row_area: wp.array[float]  # (row_total,), less dynamic rows [m^2]
+    row_normal: wp.array[wp.vec3]  # (sample_total,), outward at rest
+    row_gradient: wp.array3d[vec8]  # (block_count, sample_total, 3) [1/m]
     inner_row: wp.array2d[vec8]  # (sample_total, block_count), difference to a point inside the body
     inner_point: wp.array[wp.vec3d]  # (sample_total,) [m]
 
@@ -68,7 +68,7 @@ class Instances:
     size: wp.array[float]  # diagonal of the bounding box [m]
     tolerance: wp.array[float]  # [m], root mean square
     margin: wp.array[float]  # contact detection distance [m]
-    smoothing: wp.array[float]  # range of the C2 onset of contact [m]
+    smoothing: wp.array[float]  # range of the onset of a level contact where the body is not thin [m]
     material_model: wp.array[int]
     youngs_modulus: wp.array[float]  # [Pa]
     poissons_ratio: wp.array[float]
@@ -115,15 +115,18 @@ class PointConstraints:
     shape: wp.array2d[int]  # -1 for a pin
     body: wp.array2d[int]  # rigid body on the other side: of the shape, or that a pin follows; -1 for none
     partner: wp.array2d[int]  # the other instance, of a contact between two soft bodies; -1 within one
-    partner_row: wp.array2d[int]  # and the row of its touched point
+    partner_row: wp.array2d[int]  # and the row of its touched point; of a contact with a shape that of its sample
     arm: wp.array2d[wp.vec3]  # from the centre of mass of that body [m]
     normal: wp.array2d[wp.vec3d]
     offset: wp.array2d[wp.vec3d]  # pin: x_n - target; contact: gap n + memory; less the drift of a prescribed body [m]
     stiffness: wp.array2d[wp.float64]  # [N/m]
     dent_compliance: wp.array2d[wp.float64]  # contacts: of the dent in series with it [m/N]
     dent_depth: wp.array2d[wp.float64]  # contacts: dent from which on they harden [m]
+    onset: wp.array2d[wp.float64]  # contacts: range of the gaps of the sample's cell [m], and
+    lead: wp.array2d[wp.float64]  # how much earlier than the sample its cell begins to touch [m]
     friction: wp.array2d[wp.float64]
     stick: wp.array2d[wp.float64]  # tangential stiffness of a contact with memory [N/m]; 0: smoothed Coulomb friction
+    stick_deep: wp.array2d[wp.float64]  # the same where the dent along the surface is used up [N/m]
     anchor: wp.array2d[wp.vec3d]  # where the sample stuck at the start of the step, in the shape's frame [m]
     displacement: wp.array2d[wp.vec3d]  # of the last evaluation, relative to the other side [m]
     slip: wp.array2d[wp.vec3d]  # tangential displacement, that of the memory included [m]

@@ -45,7 +45,7 @@ ITERATIONS = 20
 """Steps of the rigid body at most."""
 HALVINGS = 16
 """Lengths of such a step that are tried: out of contact it would go centimetres, and what stops it sets in within the
-range of the onset, a thousandth of the body."""
+range of the onset, less than a thousandth of the body."""
 GAIN_LEAST = wp.constant(wp.float64(1.0e-3))
 """Decrease that the quadratic model promises, over what is left of the potential, below which it stops: the rest is
 Newton's. The decrease that was found says less: it is small too where contact has cut a step short."""
@@ -110,14 +110,13 @@ def contact_arm(
     e: int,
 ):
     """Return where the sample of a contact is at the iterate, from X."""
-    start = samples.position[i, constraints.row[i, e] - instances.row_start[i]]
+    start = samples.position[i, constraints.partner_row[i, e] - instances.row_start[i]]
     return start + constraints.displacement[i, e] + rigid_motion(instances, constraints, rigid, i, e) - X
 
 
 @wp.func
 def contact_at(
     constraints: PointConstraints,
-    smoothing: float,
     stick_range: wp.float64,
     total: wp.vec3d,
     i: int,
@@ -136,8 +135,9 @@ def contact_at(
         constraints.dent_depth[i, e],
         constraints.friction[i, e],
         constraints.stick[i, e],
+        constraints.stick_deep[i, e],
         constraints.normal_force[i, e],
-        wp.float64(smoothing),
+        constraints.onset[i, e],
         stick_range,
         mode,
         0,
@@ -172,9 +172,7 @@ def rigid_potential(
     for e in range(member, step.constraints.count[i] - step.constraints.pair_count[i], team):
         r = contact_arm(step.instances, step.constraints, step.rigid, samples, X, i, e)
         total = step.constraints.offset[i, e] + step.constraints.displacement[i, e]
-        value, _f, _H = contact_at(
-            step.constraints, step.instances.smoothing[i], step.options.stick_range, total + t + R * r - r, i, e, 0
-        )
+        value, _f, _H = contact_at(step.constraints, step.options.stick_range, total + t + R * r - r, i, e, 0)
         share += value
     weight = step.instances.mass[i] / (step.options.dt * step.options.dt)
     return team_sum(share) + rigid_share(weight, away, C, t, R)
@@ -203,8 +201,7 @@ def start_rigidly(step: NewtonStep, samples: Samples, team: int):
     for e in range(member, count, team):
         total = find_displacement(step, i, e)
         penetration = -wp.dot(step.constraints.normal[i, e], total)
-        smoothing = step.instances.smoothing[i]
-        psi, _slope, _curvature = contact_potential(step.constraints, smoothing, penetration, i, e)
+        psi, _slope, _curvature = contact_potential(step.constraints, penetration, i, e)
         stored += step.constraints.stiffness[i, e] * psi
     stored = team_sum(stored)
     if stored < wp.float64(0.5) * weight * moved:
@@ -241,9 +238,7 @@ def start_rigidly(step: NewtonStep, samples: Samples, team: int):
             r = contact_arm(step.instances, step.constraints, step.rigid, samples, X, i, e)
             arm = R * r
             total = step.constraints.offset[i, e] + step.constraints.displacement[i, e]
-            value, f, K = contact_at(
-                step.constraints, step.instances.smoothing[i], step.options.stick_range, total + t + arm - r, i, e, 1
-            )
+            value, f, K = contact_at(step.constraints, step.options.stick_range, total + t + arm - r, i, e, 1)
             lever = wp.skew(arm)
             share += value
             push += f

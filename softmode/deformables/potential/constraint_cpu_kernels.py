@@ -52,7 +52,7 @@ _EVALUATE = """
     const double* const normals = (const double*)constraints.normal.data + 3 * own;
     const double* const offsets = (const double*)constraints.offset.data + 3 * own;
     wp::vec_t<3, lanes> n, offset, d;
-    lanes stiffness, compliance, depth, friction, stick, held;
+    lanes stiffness, compliance, depth, friction, stick, deep, held, onset;
     words pinned;
     for (int k = 0; k < 8; ++k) {
         const size_t one = own + at[k];
@@ -60,8 +60,10 @@ _EVALUATE = """
         stiffness[k] = constraints.stiffness.data[one];
         compliance[k] = constraints.dent_compliance.data[one];
         depth[k] = constraints.dent_depth.data[one];
+        onset[k] = constraints.onset.data[one];
         friction[k] = constraints.friction.data[one];
         stick[k] = constraints.stick.data[one];
+        deep[k] = constraints.stick_deep.data[one];
         held[k] = constraints.normal_force.data[one];
         for (int axis = 0; axis < 3; ++axis) {
             n.c[axis][k] = normals[3 * at[k] + axis];
@@ -70,7 +72,8 @@ _EVALUATE = """
         }
     }
     const Law::contact_response_results found = Law::contact_response(
-        pinned, offset, n, d, stiffness, compliance, depth, friction, stick, held, smoothing, stick_range, mode, exact);
+        pinned, offset, n, d, stiffness, compliance, depth, friction, stick, deep, held, onset, stick_range, mode,
+        exact);
     double* const slips = (double*)constraints.slip.data + 3 * own;
     double* const forces = (double*)constraints.force.data + 3 * own;
     for (int k = 0; k < count; ++k) {
@@ -96,9 +99,7 @@ _EVALUATE = """
 
 
 @wp.func_native(
-    snippet=f"{{{SUMS}{lanes_code(contact_response, uniform=('eps', 'stick_range'))}{_EVALUATE}}}".replace(
-        "KEEP", str(KEEP)
-    )
+    snippet=f"{{{SUMS}{lanes_code(contact_response, uniform=('stick_range',))}{_EVALUATE}}}".replace("KEEP", str(KEEP))
 )
 def evaluate_eight_constraints(
     constraints: PointConstraints,
@@ -106,7 +107,6 @@ def evaluate_eight_constraints(
     q: wp.array2d[vec8d],
     q_from: wp.array2d[vec8d],
     r: wp.array2d[wp.float64],
-    smoothing: wp.float64,
     stick_range: wp.float64,
     w: int,
     i: int,
@@ -127,8 +127,7 @@ def evaluate_eight_constraints(
         q: Where the body is.
         q_from: Where it was at the start of the step.
         r: Motion of the joints.
-        smoothing: Range of the onset of contact [m].
-        stick_range: That of the smoothed friction [m].
+        stick_range: Range of the smoothed friction [m].
         w: World.
         i: Instance.
         e: First constraint.
@@ -169,7 +168,6 @@ def evaluate_constraints_of(
             q,
             step.motion.q_start,
             r,
-            wp.float64(step.instances.smoothing[i]),
             step.options.stick_range,
             w,
             i,

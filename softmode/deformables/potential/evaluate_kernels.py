@@ -146,7 +146,6 @@ def evaluate_constraint(
     if not known:
         count = step.instances.function_count[i]
         d = interpolate_change(step.basis.row, row, q, step.motion.q_start, i, count, lane, lanes)
-    smoothing = step.instances.smoothing[i]
     share = wp.float64(1.0)
     if e >= step.constraints.count[i] - step.constraints.pair_count[i]:
         j = step.constraints.partner[i, e]
@@ -155,7 +154,6 @@ def evaluate_constraint(
                 row = step.constraints.partner_row[i, e]
                 count = step.instances.function_count[j]
                 d -= interpolate_change(step.basis.row, row, q, step.motion.q_start, j, count, lane, lanes)
-            smoothing = wp.min(smoothing, step.instances.smoothing[j])
             share = wp.float64(0.5)
     if lane != 0:
         return
@@ -175,8 +173,9 @@ def evaluate_constraint(
         step.constraints.dent_depth[i, e],
         step.constraints.friction[i, e],
         step.constraints.stick[i, e],
+        step.constraints.stick_deep[i, e],
         step.constraints.normal_force[i, e],
-        wp.float64(smoothing),
+        step.constraints.onset[i, e],
         step.options.stick_range,
         mode,
         step.state.exact[w],

@@ -15,6 +15,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from softmode.deformables.quadrature.interior import Interior, interior_from_quadrature, interior_from_surface
 from softmode.deformables.quadrature.occupancy import KEPT_EXTENT, KEPT_SHARE
+from softmode.deformables.quadrature.quadrature_density import FOGGY
 from softmode.deformables.reduction.basis import KERNEL_POINTS
 from softmode.deformables.reduction.cubature import POISSON_RATIO
 from softmode.deformables.reduction.elastic_functions import EXCESS, EXCESS_WARNING
@@ -513,6 +514,14 @@ def _check_asset(body: ReducedBody, told: dict[str, float], notes: _Notes) -> No
             "open mesh",
             f"the mesh is not closed: the body is what it encloses {how}",
             "close the holes (trimesh.repair.fill_holes, or a modelling tool), and build again",
+        )
+    if (fog := told.get("quadrature_fog", 0.0)) > FOGGY:
+        notes.find(
+            "warning",
+            "fog",
+            f"the field is fog: half the level of its surface adds {100.0 * fog:.0f} % of volume (walls: 0 to 11 %)."
+            f" Its solid is taken at {told['quadrature_level_share']:.2g} of full occupancy; cavities may be full",
+            "train it with opaque walls (examples/train_field.py), or build from a mesh of the object",
         )
     told_splats = told.get("quadrature_asset_splats", 0.0)
     given = told.get("asset_splats", told_splats)

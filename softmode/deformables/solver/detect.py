@@ -83,7 +83,7 @@ def _find_contacts(t: StepTables, state: newton.State, dt: float, prescribed: bo
     t.launch_teams(
         kernels.gather_contacts,
         t.layout.instance_count,
-        *(t.instances, t.basis, t.shapes, t.samples, t.surface_stiffness, t.dent_length),
+        *(t.instances, t.basis, t.shapes, t.samples, t.motion, t.surface),
         *(t.constraints.row.shape[1], *stick),
         *(memory.stick_shape, memory.stick_point, t.constraints, t.newton.status),
     )

@@ -47,23 +47,25 @@ class SolverReducedOptions:
     step_length_min: float = 2.0**-16
     """Shortest step the line search tries."""
     contact_max: int | None = None
-    """Contacts per instance at most; more raise the overflow flag and drop those that do not touch yet. None for 0.64
-    per surface sample of the body that has most, and 256 at least."""
+    """Contacts per instance at most; more raise the overflow flag and drop those that do not touch yet. None for one
+    per surface sample of the body that has most, two where it is so thin that both sides may touch one thing, and 256
+    at least."""
     contact_margin: float = 0.01
     """Detection distance as a fraction of the body size, on top of twice the motion of the step."""
     soft_contact: bool = True
     """Whether soft bodies touch each other, and themselves where ``self_contact`` says so."""
-    contact_smoothing: float = 1.0e-3
-    """Range of the C2 onset of the contact penalty as a fraction of the body size."""
+    contact_smoothing: float = 8.0e-4
+    """Range of the onset of the contact of a level face as a fraction of the body size, or of three times its thickness
+    where that is less. That of a tilted or curved one is the range of the gaps of its sample's cell."""
     stick_ratio: float = 1.0
     """Tangential over normal stiffness of a contact that sticks to a shape; friction remembers where, so that nothing
     creeps. 0 forgets: friction is Coulomb's smoothed over ``stick_velocity``, and what it holds creeps at up to it."""
     stick_velocity: float = 1.0e-4
     """Slip velocity [m/s] below which friction without memory counts as sticking."""
 
-    def contact_room(self, sample_max: int) -> int:
-        """Return how many contacts an instance may have where no body has more than so many surface samples."""
-        return self.contact_max or max(256, 64 * math.ceil(0.64 * sample_max / 64))
+    def contact_room(self, sample_room: int) -> int:
+        """Return how many contacts an instance may have where its samples may have so many at a time."""
+        return self.contact_max or max(256, 64 * math.ceil(sample_room / 64))
 
     def __post_init__(self) -> None:
         """Check every range."""

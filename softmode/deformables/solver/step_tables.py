@@ -11,7 +11,8 @@ import numpy as np
 import warp as wp
 
 from softmode.deformables.body.reduced_body import ReducedBody
-from softmode.deformables.contact.dents import dent_lengths
+from softmode.deformables.contact.cell_kernels import Surface
+from softmode.deformables.contact.dents import sample_room, surface_table
 from softmode.deformables.contact.detection_kernels import Shapes
 from softmode.deformables.contact.pairs import SoftPairs
 from softmode.deformables.contact.shape_tables import candidate_shapes, shape_table
@@ -128,10 +129,8 @@ class StepTables:
     """All of these, for Newton's kernels."""
     rigid: RigidDofs
     """Joint dofs that take part in the solve."""
-    surface_stiffness: wp.array
-    """Young's modulus at the surface samples of all bodies relative to the body's, float (sample_total,)."""
-    dent_length: wp.array
-    """Dents at these samples under the pressure E / (1 - nu^2) at scale 1 [m], likewise."""
+    surface: Surface
+    """What contact knows of the surface samples of all bodies."""
     shapes: Shapes
     """The rigid shapes."""
     meshes: list[Any]
@@ -245,9 +244,10 @@ def allocate_tables(
         ConfigError: If a body of the model is not among ``bodies``, or a shape cannot be touched.
     """
     device = model.device
-    room = options.contact_room(max((body.surface_count for body in bodies), default=0))
+    room = options.contact_room(max((sample_room(body, options.contact_margin) for body in bodies), default=0))
     layout = lay_out(model, bodies, pair_max=room // 2 if options.soft_contact else 0)
-    instances, basis = lay_out_instances(model, layout), lay_out_bases(model, layout)
+    row_max = room + layout.pin_max if model.shape_count else 0
+    instances, basis = lay_out_instances(model, layout), lay_out_bases(model, layout, row_max)
     scaled = ScaledQuantities(
         model,
         layout,
@@ -258,12 +258,11 @@ def allocate_tables(
     )
     candidate = wp.array(candidate_shapes(model, layout), dtype=int, device=device)
     shapes, meshes = shape_table(model)
-    stiffness = wp.array(surface_stiffness(layout.bodies), dtype=float, device=device)
-    dents = wp.array(np.concatenate([dent_lengths(body) for body in layout.bodies]), dtype=float, device=device)
+    first_row = layout.first_pin_row + int(layout.pin_count.sum())
+    surface = surface_table(layout.bodies, surface_stiffness(layout.bodies), first_row, row_max, device)
     pairs = None
     if layout.pair_max:
-        surface = (scaled.spacing, stiffness, dents)
-        pairs = SoftPairs(layout, instances, basis, options.stick_ratio, *surface, device)
+        pairs = SoftPairs(layout, instances, basis, options.stick_ratio, scaled.spacing, surface, device)
     system_start, system = join_systems(layout, instances, rigid.count_max + 1, device)
 
     blocks, count, square = layout.block_count, layout.instance_count, 3 * layout.block_count**2
@@ -333,8 +332,7 @@ def allocate_tables(
         newton=state,
         step=step,
         rigid=rigid,
-        surface_stiffness=stiffness,
-        dent_length=dents,
+        surface=surface,
         shapes=shapes,
         meshes=meshes,
         candidate=candidate,

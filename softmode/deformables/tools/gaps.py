@@ -20,8 +20,8 @@ def rigid_gaps(solver: SolverReduced | SolverCoupledReduced) -> NDArray[np.float
     contacts = solver.view.constraints
     used = np.arange(contacts.shape.shape[1]) < contacts.count.numpy()[:, None]
     touching = used & (contacts.shape.numpy() >= 0)
-    gaps = np.einsum("nek,nek->ne", contacts.normal.numpy(), contacts.offset.numpy()) + contact_dents(contacts)
-    return gaps[touching]
+    start = np.einsum("nek,nek->ne", contacts.normal.numpy(), contacts.offset.numpy()) + contacts.lead.numpy()
+    return (start + contact_dents(contacts))[touching]
 
 
 def start_overlaps(

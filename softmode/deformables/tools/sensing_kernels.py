@@ -49,7 +49,8 @@ class Touch:
 def point_of(instances: Instances, basis: Basis, motion: Motion, constraints: PointConstraints, i: int, e: int):
     """Return where a constraint was at the start of the step [m]: both bodies feel the force there.
 
-    Where a sample of another soft body touches this one, the row is a mean of rows and its place that of the sample.
+    On a shape it is the centre of pressure of the sample's cell. Where a sample of another soft body touches this one,
+    the row is a mean of rows and its place that of the sample.
     """
     row = constraints.row[i, e]
     k = i
@@ -76,7 +77,8 @@ def normal_part(constraints: PointConstraints, i: int, e: int):
 def first_of_sample(constraints: PointConstraints, first: int, i: int, e: int):
     """Return whether no earlier constraint is the same sample pressed by the same body: its area counts once."""
     for k in range(first, e):
-        same = constraints.row[i, k] == constraints.row[i, e] and constraints.body[i, k] == constraints.body[i, e]
+        same = constraints.partner_row[i, k] == constraints.partner_row[i, e]
+        same = same and constraints.body[i, k] == constraints.body[i, e]
         if same and constraints.shape[i, k] >= 0 and normal_part(constraints, i, k) > wp.float64(0.0):
             return False
     return True
@@ -158,7 +160,8 @@ def read_contacts(
             if pressing > wp.float64(0.0):
                 touch = add_pressure(touch, pressing, x, n)
                 if first_of_sample(constraints, first, i, e):
-                    touch.area += wp.float64(sample_area(instances.scale[i], basis.row_area[constraints.row[i, e]]))
+                    area = basis.row_area[constraints.partner_row[i, e]]
+                    touch.area += wp.float64(sample_area(instances.scale[i], area))
     if column < soft.shape[0]:
         write_readings(matrix_out, w, l, column, touch)
     else:
@@ -217,6 +220,8 @@ def find_samples(
     if e < instances.pin_count[i] or e >= constraints.count[i] or is_internal(constraints, i, e):
         return
     found = constraints.row[i, e] - instances.row_start[i]
+    if constraints.shape[i, e] >= 0:
+        found = constraints.partner_row[i, e] - instances.row_start[i]
     if constraints.row[i, e] >= basis.row_point.shape[0]:
         x = point_of(instances, basis, motion, constraints, i, e)
         nearest = wp.float64(1.0e30)

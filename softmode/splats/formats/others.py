@@ -8,14 +8,21 @@ from softmode.errors import AssetError
 
 _TRANSFORM = "npx @playcanvas/splat-transform {file} {stem}.ply"
 _NERFSTUDIO = "ns-export gaussian-splat --load-config CONFIG.yml --output-dir ."
+_FIELD = "; or sample its field: softmode radiance sample MODULE:FUNCTION {stem}.npz"
 _OPEN3D = "python -c \"import open3d as o; o.io.write_point_cloud('{stem}.ply', o.io.read_point_cloud('{file}'))\""
 _BLENDER = "blender -b --python-expr \"import bpy; bpy.ops.{load}; bpy.ops.export_scene.gltf(filepath='{{stem}}.glb')\""
 _GMSH = "gmsh -2 {file} -o {stem}.stl"
 OTHERS: dict[str, tuple[str, str]] = {
     ".ksplat": ("splats of mkkellogg's viewer", _TRANSFORM),
     ".lcc": ("splats of XGRIDS", _TRANSFORM),
-    **dict.fromkeys((".ckpt", ".pt", ".pth"), ("a checkpoint of a training", _NERFSTUDIO)),
+    **dict.fromkeys((".ckpt", ".pt", ".pth"), ("a checkpoint of a training", _NERFSTUDIO + _FIELD)),
     **dict.fromkeys((".yml", ".yaml"), ("a configuration of nerfstudio", _NERFSTUDIO.replace("CONFIG.yml", "{file}"))),
+    **dict.fromkeys(
+        (".ingp", ".msgpack"),
+        ("a snapshot of instant-ngp", "python scripts/run.py --load_snapshot {file} --save_mesh {stem}.obj" + _FIELD),
+    ),
+    ".th": ("a checkpoint of TensoRF", "python train.py --ckpt {file} --export_mesh 1 --render_only 1" + _FIELD),
+    ".vdb": ("a volume of OpenVDB", "nanovdb_convert {file} {stem}.nvdb"),
     ".npy": (
         "an array without a name",
         "python -c \"import numpy as np; np.savez('{stem}.npz', points=np.load('{file}')[:, :3])\"",

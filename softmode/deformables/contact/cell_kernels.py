@@ -1,0 +1,229 @@
+"""Device code of the cells that contact samples stand for: which part of a cell touches, and how much around it does.
+
+A sample stands for a cell of the surface, of the area A at rest. Its contact is the mean of springs over the gaps of
+that cell, which tilt and curvature spread evenly over a range e, the *onset* (see ``penalty_kernels``). With the normal
+n of what is touched, the rest normal N and F of the body a step's velocity ahead,
+
+    m = P_N F^T n                               slope of the gap over the cell
+    x = |m| L,  L = sqrt(3 A / pi)              range of a strip with the variance of a disc of area A
+    t = x / (1 + (x/a)^4) r^2/(9 + r^2)         range by tilt, none of a steep cell; r: compliance of the dent over that
+                                                of the penalty, a: ``steepest``
+    b = A (H + H_other) / (2 pi)                range by the mean curvatures of both: exact for a sphere
+    e = sqrt(e_0^2 + t^2 + b^2)                 e_0: ``contact_smoothing``
+    q = e/2 - gap - b/2 - 0.15 e_0              penetration, a step's velocity ahead
+    T = -min(L/2 - q L/(3 t), L t/(6 q)) m/|m|  centre of pressure from the sample, at rest, in the onset;
+                                                -L t/(12 (q - e/2)) m/|m| beyond
+
+The row of the contact is that of the sample plus T . grad: force and friction act at the centre of pressure. The dent
+of the sample is as much less as its neighbourhood touches the same thing: the functions carry what is wide.
+"""
+
+import newton
+import warp as wp
+
+from softmode.deformables.model.declare import struct
+from softmode.deformables.model.deformation_kernels import displacement_gradient
+from softmode.deformables.model.lane_kernels import vec8d
+from softmode.deformables.model.struct_kernels import SLOTS, Basis, Instances, Motion, interpolate
+
+wp.set_module_options({"enable_backward": False})
+
+SPHERE, CAPSULE, CYLINDER = (
+    wp.constant(int(kind)) for kind in (newton.GeoType.SPHERE, newton.GeoType.CAPSULE, newton.GeoType.CYLINDER)
+)
+PI = wp.constant(wp.float64(3.14159265358979))
+FADE = wp.constant(1.0e-3)
+"""Gap over the size of the body, besides its cell's range, over which a neighbour counts as touching less and less:
+long against a dent, or a face that rides in its onset is soft and stiff in turns."""
+FACING = wp.constant(wp.float64(0.2))
+"""Cosine below which a cell belongs to a face around an edge, whose tilt says nothing of the gaps."""
+LATE = wp.constant(wp.float64(0.15))
+"""Share of e_0 by which a contact begins later than half its range outside: a face that rides in its onset then stands,
+from 1 to 10 % of strain, within 1 % of where it should."""
+NEAR = wp.constant(wp.float64(0.5))
+"""Share of that bound, as a gap, beyond which a cell is level and nothing around it counts, as it cannot touch but by
+an impact: what flies past a shape must not feel that it might lean against it."""
+TURNING = wp.constant(wp.float64(9.0))
+"""Square of the dent, in penalties, with which a cell turns half of its way."""
+LEVEL = wp.constant(wp.float64(1.0e-3))
+"""Range by tilt over e_0 below which a cell is level."""
+
+
+@struct
+class Surface:
+    """What contact knows of the surface samples of all bodies, (sample_total,) where not said."""
+
+    relative_stiffness: wp.array[float]  # Young's modulus relative to the body's
+    dent_length: wp.array[float]  # dent at scale 1 under the pressure E / (1 - nu^2), see ``dents`` [m]
+    slenderness: wp.array[float]  # size of the body over the smaller of it and three thicknesses
+    curvature: wp.array[float]  # mean curvature of the asset at rest [1/m]
+    start: wp.array[int]  # (sample_total + 1,), where each sample's neighbourhood begins in
+    neighbour: wp.array[int]  # samples, counted within their body, and
+    weight: wp.array[float]  # their weights, of sum ``CARRIED``
+    first_row: int  # of the rows at centres of pressure
+    row_max: int  # such rows of an instance
+
+
+@struct
+class Cell:
+    """The cell of a sample in a contact."""
+
+    onset: wp.float64  # range of its gaps [m]
+    lead: wp.float64  # how much earlier than the sample it begins to touch [m]
+    centre: wp.vec3d  # centre of pressure from the sample, at rest [m]
+
+
+@struct
+class CellShape:
+    """What a cell is, whatever its body does."""
+
+    normal: wp.vec3d  # at rest, outward
+    width: wp.float64  # L [m]
+    bend: wp.float64  # b [m]
+    least: wp.float64  # e_0 [m]
+    steepest: (
+        wp.float64
+    )  # range by tilt beyond which a cell counts as level again: most of the margin, thinner of a thin body [m]
+    fade: wp.float64  # that of a level and flat cell [m]
+
+
+@wp.func
+def shape_of_cell(surface: Surface, instances: Instances, basis: Basis, i: int, row: int, other: float):
+    """Return what the cell of a sample is against something of a mean curvature [1/m]."""
+    shape = CellShape()
+    s = instances.scale[i]
+    area = wp.float64(basis.row_area[row])
+    shape.normal = wp.vec3d(basis.row_normal[row])
+    shape.width = wp.sqrt(wp.float64(3.0) / PI * area)
+    bend = wp.float64(s * s) * area * wp.float64(surface.curvature[row] / s + other) / (wp.float64(2.0) * PI)
+    shape.bend = wp.max(bend, wp.float64(0.0))
+    shape.least = wp.float64(instances.smoothing[i] / surface.slenderness[row])
+    shape.steepest = wp.float64(0.7 * instances.margin[i] / surface.slenderness[row])
+    shape.fade = wp.float64(FADE * instances.size[i])
+    return shape
+
+
+@wp.func
+def lean_of(shape: CellShape, F: wp.mat33d, n: wp.vec3d):
+    """Return t m / |m| of a cell [m] whose body has the gradient F; n is the normal of what it touches."""
+    one = wp.float64(1.0)
+    pull = wp.transpose(F) * n
+    facing = -wp.dot(pull, shape.normal)
+    if facing <= FACING * wp.length(pull):
+        return wp.vec3d()
+    lean = shape.width * (pull + facing * shape.normal)
+    share = wp.length_sq(lean) / (shape.steepest * shape.steepest)
+    return lean / (one + share * share)
+
+
+@wp.func
+def fade_of(shape: CellShape, F: wp.mat33d, n: wp.vec3d):
+    """Return the range of the gap over which a neighbour counts as touching less and less [m]."""
+    ranges = wp.length_sq(lean_of(shape, F, n)) + shape.bend * shape.bend
+    return shape.fade + wp.sqrt(ranges + wp.float64(1.0e-24))  # which has a derivative at zero
+
+
+@wp.func
+def cell_at(shape: CellShape, F: wp.mat33d, n: wp.vec3d, gap: wp.float64, closing: wp.float64, ratio: wp.float64):
+    """Return a cell whose sample has a gap [m], ``closing`` [m] more ahead, and a dent of ``ratio`` penalties.
+
+    The cell turns with the dent: where there is none and the penalty alone keeps surfaces apart, so stiff a centre of
+    pressure would move the body to and fro. What begins a step farther away than any cell reaches is level: it may pass
+    what it would lean against.
+    """
+    half = wp.float64(0.5)
+    zero = wp.float64(0.0)
+    lean = ratio * ratio / (TURNING + ratio * ratio) * lean_of(shape, F, n)
+    if gap > NEAR * shape.steepest:
+        lean = wp.vec3d()
+    tilt = wp.length(lean)
+    cell = Cell()
+    cell.onset = wp.sqrt(shape.least * shape.least + shape.bend * shape.bend + tilt * tilt)
+    cell.lead = half * (cell.onset - shape.bend) - LATE * shape.least
+    if tilt > LEVEL * shape.least:
+        q = cell.lead - gap - closing
+        at = half * shape.width
+        if q > cell.onset:
+            at = shape.width * tilt / (wp.float64(12.0) * q - wp.float64(6.0) * cell.onset)
+        elif q > zero:
+            if q < tilt:
+                at -= q * shape.width / (wp.float64(3.0) * tilt)
+            at = wp.min(at, shape.width * tilt / (wp.float64(6.0) * q))
+        cell.centre = -at / tilt * lean
+    return cell
+
+
+@wp.func
+def gradient_of(instances: Instances, basis: Basis, q: wp.array2d[vec8d], i: int, row: int):
+    """Return the deformation gradient F of an instance at a surface sample."""
+    G = displacement_gradient(basis.row_gradient, q, i, row, instances.function_count[i])
+    return wp.identity(n=3, dtype=wp.float64) + G
+
+
+@wp.func
+def ahead_of(
+    instances: Instances, basis: Basis, motion: Motion, start: wp.mat33d, n: wp.vec3d, i: int, row: int, dt: float
+):
+    """Return F of a sample and how far it moves along n [m] where it goes on for a step at its velocity.
+
+    How far a ball rolls in a step is what turns it: a centre of pressure of the start would lag by half a step.
+    """
+    count = instances.function_count[i]
+    h = wp.float64(dt)
+    rate = displacement_gradient(basis.row_gradient, motion.qd_start, i, row, count)
+    return start + h * rate, h * wp.dot(n, interpolate(basis.row, row, motion.qd_start, i, count))
+
+
+@wp.func
+def touching(x: wp.float64):
+    """Return how much a neighbour counts as touching, from none at 0 to all at 1."""
+    y = wp.min(wp.max(x, wp.float64(0.0)), wp.float64(1.0))
+    return y * y * (wp.float64(3.0) - wp.float64(2.0) * y)
+
+
+@wp.func
+def neighbour_at(shape: CellShape, fade: wp.float64, gap: wp.float64):
+    """Return where a neighbour with a gap [m] stands between not touching, 0, and touching, 1."""
+    half = wp.float64(0.5)
+    return wp.float64(1.0) - (gap + half * (shape.bend - shape.least)) / fade
+
+
+@wp.func
+def touched_share(
+    surface: Surface,
+    found: wp.array3d[int],  # (instance_count, sample_max, SLOTS), what is touched
+    gap: wp.array3d[wp.float64],  # likewise [m]
+    shape: CellShape,
+    fade: wp.float64,
+    i: int,
+    row: int,
+    other: int,
+):
+    """Return c, the share of a sample's neighbourhood that touches the same thing at the start of the step."""
+    carried = wp.float64(0.0)
+    for k in range(surface.start[row], surface.start[row + 1]):
+        t = surface.neighbour[k]
+        for slot in range(SLOTS):
+            if found[i, t, slot] == other:
+                carried += wp.float64(surface.weight[k]) * touching(neighbour_at(shape, fade, gap[i, t, slot]))
+    return carried
+
+
+@wp.func
+def shape_curvature(kind: int, size: wp.vec3, across: float):
+    """Return the mean curvature [1/m] of a rigid shape; ``across``: cosine between its axis and the normal."""
+    if kind == SPHERE:
+        return 1.0 / size[0]
+    if kind == CAPSULE or kind == CYLINDER:
+        return 0.5 * (1.0 - across * across) / size[0]
+    return float(0.0)
+
+
+@wp.func
+def write_row(basis: Basis, row: int, sample: int, X: wp.vec3d):
+    """Write the row at a place beside a sample [m]."""
+    basis.row_point[row] = basis.row_point[sample] + X
+    x = wp.vec3(X)
+    for b in range(basis.row.shape[1]):
+        value = basis.row[sample, b] + x[0] * basis.row_gradient[b, sample, 0]
+        basis.row[row, b] = value + x[1] * basis.row_gradient[b, sample, 1] + x[2] * basis.row_gradient[b, sample, 2]

@@ -1,0 +1,300 @@
+"""Device side of the adjoint through what a contact takes from the start of a step: its cell, what touches around it.
+
+Onset, centre of pressure T and the fade of the neighbourhood follow the gradient F and the gap of the sample a step's
+velocity ahead, and the share of the neighbourhood that does not touch follows the gaps of its samples at the start; see
+``cell_kernels``. With lambda the costate, a contact's row b + T . grad b, force f and displacement x feel T by
+
+    dL/dT = (grad lambda)^T f - (grad (q_t - q_(t-1)))^T x_bar + (n . x_bar) (F_ahead - F_start)^T n,
+
+x_bar = -dL/dx, the last of the offset, which leaves out what T closes by turning.
+"""
+
+import warp as wp
+
+from softmode.deformables.contact.cell_kernels import (
+    NEAR,
+    PI,
+    CellShape,
+    Surface,
+    ahead_of,
+    cell_at,
+    fade_of,
+    gradient_of,
+    neighbour_at,
+    shape_of_cell,
+    touched_share,
+    write_row,
+)
+from softmode.deformables.contact.detection_kernels import Shapes, curvature_of, shape_area, shape_drift
+from softmode.deformables.contact.penalty_kernels import (
+    BULK_FACTOR,
+    HARDENING,
+    HARDENING_DEPTH,
+    HARDENING_RANGE,
+    dent_exponents,
+    penalty,
+    stiffness_exponents,
+)
+from softmode.deformables.gradients.adjoint_kernels import Linearised, Sums, turned_back
+from softmode.deformables.model.deformation_kernels import displacement_gradient
+from softmode.deformables.model.lane_kernels import vec8d
+from softmode.deformables.model.struct_kernels import (
+    OVERLAP,
+    SLOTS,
+    Basis,
+    Instances,
+    Motion,
+    PointConstraints,
+    Samples,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def gap_of(instances: Instances, samples: Samples, i: int, sample: int, shape: int):
+    """Return the gap [m] of a sample with a shape at the start of the step, as its contact takes it."""
+    s = sample - instances.row_start[i]
+    gap = samples.gap[i, s, 0]
+    for slot in range(1, SLOTS):
+        if samples.shape[i, s, slot] == shape:
+            gap = samples.gap[i, s, slot]
+    return wp.max(gap, -wp.float64(OVERLAP * instances.size[i]))
+
+
+@wp.func
+def cell_loss(
+    shape: CellShape,
+    F: wp.mat33d,
+    n: wp.vec3d,
+    gap: wp.float64,
+    closing: wp.float64,
+    ratio: wp.float64,
+    onset_bar: wp.float64,
+    lead_bar: wp.float64,
+    centre_bar: wp.vec3d,
+):
+    """Return the loss to first order in what ``cell_at`` returns."""
+    cell = cell_at(shape, F, n, gap, closing, ratio)
+    return onset_bar * cell.onset + lead_bar * cell.lead + wp.dot(centre_bar, cell.centre)
+
+
+@wp.func
+def by_onset(p: wp.float64, eps: wp.float64):
+    """Return the derivative of the slope of the penalty by its range."""
+    half = wp.float64(0.5)
+    x = wp.min(wp.max(p, wp.float64(0.0)) / eps, wp.float64(1.0))
+    return -half * x * x
+
+
+@wp.func
+def slope_of_touching(y: wp.float64):
+    """Return the derivative of ``touching``."""
+    if y <= wp.float64(0.0) or y >= wp.float64(1.0):
+        return wp.float64(0.0)
+    return wp.float64(6.0) * y * (wp.float64(1.0) - y)
+
+
+# Warp writes the adjoints of what ``wp.grad`` calls only if nothing in the module called it before, and takes kernels
+# in the order of their hashes: so this one has a module of its own, and ``wp.grad`` comes first in it.
+@wp.kernel(module="unique", enable_backward=False)
+def accumulate_cells(
+    instances: Instances,
+    basis: Basis,
+    motion: Motion,
+    shapes: Shapes,
+    samples: Samples,
+    surface: Surface,
+    constraints: PointConstraints,
+    q: wp.array2d[vec8d],
+    costate: wp.array2d[vec8d],
+    dt: float,
+    # In and out:
+    sums: Sums,
+    step: Linearised,
+):
+    """Find the loss by the cell of each contact; add what the scale of the body does to it."""
+    i, e = wp.tid()
+    step.cell_gradient[i, e] = wp.mat33d()
+    step.cell_place[i, e] = wp.vec3d()
+    step.cell_spared[i, e] = wp.float64(0.0)
+    if e < instances.pin_count[i] or e >= constraints.count[i]:
+        return
+    zero = wp.float64(0.0)
+    half = wp.float64(0.5)
+    count = instances.function_count[i]
+    row = constraints.partner_row[i, e]
+    shape = constraints.shape[i, e]
+    n = constraints.normal[i, e]
+    k = constraints.stiffness[i, e]
+    eps = constraints.onset[i, e]
+    depth = constraints.dent_depth[i, e]
+    p = -wp.dot(n, constraints.offset[i, e] + constraints.displacement[i, e])
+    deep = HARDENING_RANGE * eps
+    ratio = k * constraints.dent_compliance[i, e]
+    share = wp.float64(1.0) / (wp.float64(1.0) + ratio)
+    _psi, _slope, curvature = penalty(p, eps)
+    _deep_psi, _deep_slope, deep_curvature = penalty(p - depth, deep)
+    steep = HARDENING * deep_curvature
+    force_bar = k * step.normal_bar[i, e][0]
+    onset_bar = HARDENING_RANGE * HARDENING * by_onset(p - depth, deep)
+    onset_bar = force_bar * (onset_bar + share * by_onset(p, eps))
+    lead_bar = force_bar * (share * curvature + steep)
+    depth_bar = step.normal_bar[i, e][2] - force_bar * steep * depth
+
+    start = gradient_of(instances, basis, motion.q_start, i, row)
+    ahead, closing = ahead_of(instances, basis, motion, start, n, i, row, dt)
+    x = wp.vec3(samples.position[i, row - instances.row_start[i]])
+    closing -= wp.dot(n, wp.vec3d(shape_drift(shapes, shape, x, dt)))
+    gap = gap_of(instances, samples, i, row, shape)
+    other = curvature_of(shapes, shape, n)
+    cell_shape = shape_of_cell(surface, instances, basis, i, row, other)
+    back = step.contact_bar[i, e]
+    along = wp.dot(n, back)
+    centre_bar = wp.vec3d()
+    if constraints.row[i, e] != row:
+        moved = gradient_of(instances, basis, q, i, row) - start
+        pulled = displacement_gradient(basis.row_gradient, costate, i, row, count)
+        centre_bar = wp.transpose(pulled) * constraints.force[i, e] - wp.transpose(moved) * back
+        centre_bar += along * (wp.transpose(ahead - start) * n)
+        centre_bar += wp.transpose(start) * turned_back(shapes, shape, back, dt)
+    by_shape, by_F, _by_n, _by_gap, by_place, by_ratio, _o, _l, _c = wp.grad(cell_loss)(
+        cell_shape, ahead, n, gap, closing, ratio, onset_bar, lead_bar, centre_bar
+    )
+    fade_shape, fade_F, _fade_n = wp.grad(fade_of)(cell_shape, ahead, n)
+    cell = cell_at(cell_shape, ahead, n, gap, closing, ratio)
+    fade = fade_of(cell_shape, ahead, n)
+    spared = zero  # or one, far away: either does not change
+    if gap <= NEAR * cell_shape.steepest:
+        touched = touched_share(surface, samples.shape, samples.gap, cell_shape, fade, i, row, shape)
+        spared = wp.float64(1.0) - touched * touched
+    by_gap = zero
+    by_fade = zero
+    for m in range(surface.start[row], surface.start[row + 1]):
+        t = surface.neighbour[m]
+        for slot in range(SLOTS):
+            if samples.shape[i, t, slot] == shape:
+                y = neighbour_at(cell_shape, fade, samples.gap[i, t, slot])
+                change = wp.float64(surface.weight[m]) * slope_of_touching(y) / fade
+                by_gap += change
+                by_fade -= (wp.float64(1.0) - y) * change
+
+    by_log = by_ratio * ratio
+    spared_bar = zero
+    if spared > zero:
+        own = depth_bar * (wp.float64(1.0) - HARDENING_DEPTH * cell_shape.least / depth)  # a part no dent shifts
+        spared_bar = (step.normal_bar[i, e][1] + own + by_log) / spared
+        spared_bar *= wp.float64(2.0) * wp.sqrt(wp.max(wp.float64(1.0) - spared, zero))  # by -c
+    step.cell_spared[i, e] = spared_bar
+    fade_bar = spared_bar * by_fade
+    step.cell_gradient[i, e] = by_F + fade_bar * fade_F + along * wp.outer(n, cell.centre)
+    step.cell_place[i, e] = by_place * n
+
+    # lengths grow with the scale, but not the radius of what is touched
+    above = half * spared_bar * by_gap
+    bend_bar = by_shape.bend + fade_bar * fade_shape.bend + above
+    area = wp.float64(instances.scale[i] * instances.scale[i] * basis.row_area[row])
+    by_scale = depth_bar + fade_bar * fade_shape.fade * cell_shape.fade
+    by_scale += (by_shape.steepest + fade_bar * fade_shape.steepest) * cell_shape.steepest
+    by_scale += (by_shape.least - above) * cell_shape.least
+    if cell_shape.bend > zero:
+        by_scale += bend_bar * (cell_shape.bend + area * wp.float64(other) / (wp.float64(2.0) * PI))
+    firm = surface.relative_stiffness[row] * surface.slenderness[row]
+    powers = stiffness_exponents(instances, i, BULK_FACTOR, firm, shape_area(shapes, shape), dt)
+    powers = by_log * (powers + dent_exponents(instances, i))
+    sums.contact[i, e] = sums.contact[i, e] + powers + wp.vec4d(zero, zero, zero, by_scale)
+
+
+@wp.kernel
+def restore_rows(
+    instances: Instances,
+    basis: Basis,
+    motion: Motion,
+    shapes: Shapes,
+    samples: Samples,
+    surface: Surface,
+    constraints: PointConstraints,
+    dt: float,
+):
+    """Write the rows at the centres of pressure of a recorded step."""
+    i, e = wp.tid()
+    if e < instances.pin_count[i] or e >= constraints.count[i]:
+        return
+    row = constraints.partner_row[i, e]
+    if constraints.row[i, e] == row:
+        return
+    shape = constraints.shape[i, e]
+    n = constraints.normal[i, e]
+    start = gradient_of(instances, basis, motion.q_start, i, row)
+    ahead, closing = ahead_of(instances, basis, motion, start, n, i, row, dt)
+    x = wp.vec3(samples.position[i, row - instances.row_start[i]])
+    closing -= wp.dot(n, wp.vec3d(shape_drift(shapes, shape, x, dt)))
+    cell_shape = shape_of_cell(surface, instances, basis, i, row, curvature_of(shapes, shape, n))
+    ratio = constraints.stiffness[i, e] * constraints.dent_compliance[i, e]
+    cell = cell_at(cell_shape, ahead, n, gap_of(instances, samples, i, row, shape), closing, ratio)
+    write_row(basis, constraints.row[i, e], row, cell.centre)
+
+
+@wp.kernel
+def spread_over_neighbours(
+    instances: Instances,
+    basis: Basis,
+    motion: Motion,
+    shapes: Shapes,
+    samples: Samples,
+    surface: Surface,
+    constraints: PointConstraints,
+    dt: float,
+    # In and out:
+    step: Linearised,
+):
+    """Sum the loss by the gap of each sample over the contacts whose neighbourhood it is in, in their order."""
+    i = wp.tid()
+    for s in range(instances.sample_count[i]):
+        step.sample_place[i, s] = wp.vec3d()
+    for e in range(instances.pin_count[i], constraints.count[i]):
+        if step.cell_spared[i, e] == wp.float64(0.0):
+            continue
+        row = constraints.partner_row[i, e]
+        shape = constraints.shape[i, e]
+        n = constraints.normal[i, e]
+        start = gradient_of(instances, basis, motion.q_start, i, row)
+        ahead, _closing = ahead_of(instances, basis, motion, start, n, i, row, dt)
+        cell_shape = shape_of_cell(surface, instances, basis, i, row, curvature_of(shapes, shape, n))
+        fade = fade_of(cell_shape, ahead, n)
+        for m in range(surface.start[row], surface.start[row + 1]):
+            t = surface.neighbour[m]
+            for slot in range(SLOTS):
+                if samples.shape[i, t, slot] == shape:
+                    y = neighbour_at(cell_shape, fade, samples.gap[i, t, slot])
+                    change = wp.float64(surface.weight[m]) * slope_of_touching(y) / fade
+                    step.sample_place[i, t] = step.sample_place[i, t] + step.cell_spared[i, e] * change * n
+
+
+@wp.kernel
+def propagate_cells(
+    instances: Instances,
+    basis: Basis,
+    constraints: PointConstraints,
+    step: Linearised,
+    dt: wp.float64,
+    # In and out: dL/dq and dL/dv at the start of the step
+    q_bar: wp.array2d[vec8d],
+    qd_bar: wp.array2d[vec8d],
+):
+    """Pass the loss by cells and gaps to the start of the step."""
+    i, e = wp.tid()
+    stride = basis.row.shape[1]
+    b = e % stride
+    axis = e / stride
+    ahead = vec8d()
+    for k in range(instances.pin_count[i], constraints.count[i]):
+        row = constraints.partner_row[i, k]
+        ahead = ahead + step.cell_place[i, k][axis] * vec8d(basis.row[row, b])
+        for j in range(3):
+            ahead = ahead + step.cell_gradient[i, k][axis, j] * vec8d(basis.row_gradient[b, row, j])
+    start = vec8d()
+    for s in range(instances.sample_count[i]):
+        start = start + step.sample_place[i, s][axis] * vec8d(basis.row[instances.row_start[i] + s, b])
+    q_bar[i, e] = q_bar[i, e] + ahead + start
+    qd_bar[i, e] = qd_bar[i, e] + dt * ahead

@@ -1,0 +1,147 @@
+"""Cells: what a contact sample stands for, against closed forms for whole faces, stacks, rest and slopes."""
+
+import newton
+import numpy as np
+import pytest
+import warp as wp
+from scipy.optimize import brentq
+
+from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.contact.dents import CARRIED, mean_curvature, neighbourhoods, sample_room
+from softmode.deformables.materials.material import Material
+from softmode.deformables.model.authoring import add_reduced_body
+from tests.bodies import bar, cube, sheet, smooth_ball
+from tests.scenes import GRAVITY, Scene
+
+NU = 0.3
+"""Poisson's ratio of what is pressed."""
+DOWN = (0.0, 0.0, -GRAVITY)
+
+
+def uniaxial(strain: float, modulus: float) -> float:
+    """Return the stress of the default material under a uniaxial strain, free across [Pa].
+
+    P = m (1 - 1 / (I + 1)) F + l (J - a) cof F, m = 4/3 mu, l = lambda + 5/6 mu, a = 1 + 3 m / (4 l).
+    """
+    mu, lam = modulus / (2.0 + 2.0 * NU), modulus * NU / ((1.0 + NU) * (1.0 - 2.0 * NU))
+    m, k = 4.0 / 3.0 * mu, lam + 5.0 / 6.0 * mu
+
+    def stress(along: float, across: float) -> tuple[float, float]:
+        shear = m * (1.0 - 1.0 / (along**2 + 2.0 * across**2 + 1.0))
+        volume = k * (along * across**2 - 1.0 - 0.75 * m / k)
+        return shear * along + volume * across**2, shear * across + volume * across * along
+
+    across = brentq(lambda x: stress(1.0 - strain, x)[1], 0.9, 1.3)
+    return -stress(1.0 - strain, across)[0]
+
+
+@pytest.mark.parametrize("strain", [0.01, pytest.param(0.04, marks=pytest.mark.rest), 0.1])
+@pytest.mark.parametrize("body", [cube, bar, sheet])
+def test_whole_faces(body, strain: float) -> None:
+    """Between two plates without friction a block presses as the uniaxial law to 5 %, a thin one too, without a flag.
+
+    The functions carry nearly the whole of it: what dents there is 2 % of the squeeze at most.
+    """
+    block, modulus = body(), 1.0e5
+    size = np.ptp(block.bounds, axis=0)
+
+    def populate(world: newton.ModelBuilder) -> None:
+        material = Material(youngs_modulus=modulus, poissons_ratio=NU, density=300.0, friction=0.0, mass_damping=100.0)
+        add_reduced_body(world, block, material=material, position=tuple(-block.bounds.mean(axis=0)))
+        for side in (-1.0, 1.0):
+            z = side * (0.5 * (1.0 - strain) * size[2] + 0.02)
+            world.add_shape_box(
+                -1, xform=wp.transform(wp.vec3(0.0, 0.0, z), wp.quat_identity()), hx=0.4, hy=0.4, hz=0.02
+            )
+
+    scene = Scene(populate, [block], dt=0.01)
+    forces = []
+    for _ in range(45):
+        scene.step()
+        constraints = scene.reduced.view.constraints
+        count = int(constraints.count.numpy()[0])
+        forces.append(np.maximum(constraints.force.numpy()[0, :count, 2], 0.0).sum())
+        assert scene.reduced.status.numpy()[0] == 0
+    expected = uniaxial(strain, modulus) * size[0] * size[1]
+    assert forces[-1] == pytest.approx(expected, rel=0.055 if body is sheet else 0.05)
+    assert np.ptp(forces[-4:]) <= 1.0e-3 * expected
+    assert np.abs(scene.state.softmode.dent.numpy()).max() <= 0.02 * strain * size[2]
+
+
+@pytest.mark.parametrize("count", [2, pytest.param(3, marks=pytest.mark.rest)])
+def test_soft_stack_stands(count: int) -> None:
+    """Cubes of 20 kPa with 4 mm offsets: the top stands where each sags under what is on it, within 1 %."""
+    edge, modulus, density = 0.1, 2.0e4, 300.0
+    block = cube(surface_count=400)
+
+    def populate(world: newton.ModelBuilder) -> None:
+        material = Material(youngs_modulus=modulus, density=density, mass_damping=2.0)
+        for k in range(count):
+            place = (0.004 * k, -0.003 * k, 0.5 * edge + k * edge)
+            add_reduced_body(world, block, material=material, position=place)
+
+    scene = Scene(populate, [block], gravity=DOWN, ground=0.8, dt=1.0 / 240.0)
+    replay, status = scene.capture(), 0
+    for _ in range(180):
+        replay()
+        status |= int(scene.reduced.status.numpy()[0])
+    sag = sum(density * GRAVITY * edge**2 / modulus * (k + 0.5) for k in range(count))
+    top = scene.centre(count - 1)[2] + 0.5 * edge
+    assert top == pytest.approx(count * edge - sag, rel=0.01)
+    assert status == 0
+
+
+def still(body: ReducedBody, modulus: float) -> float:
+    """Return the kinetic energy over m g R that a body has left after 2 s on the ground."""
+
+    def populate(world: newton.ModelBuilder) -> None:
+        material = Material(youngs_modulus=modulus, density=300.0)
+        add_reduced_body(world, body, material=material, position=(0.0, 0.0, 0.0502))
+
+    scene = Scene(populate, [body], gravity=DOWN, ground=0.8, dt=1.0 / 240.0)
+    replay = scene.capture()
+    for _ in range(240):
+        replay()
+    return scene.kinetic_energy() / (scene.mass() * GRAVITY * 0.05)
+
+
+@pytest.mark.parametrize("surface_count", [80, 150, 400])
+@pytest.mark.parametrize("modulus", [1.0e4, pytest.param(1.0e5, marks=pytest.mark.rest), 1.0e6])
+def test_cubes_come_to_rest(modulus: float, surface_count: int) -> None:
+    """Large cells and small ones: what a cell takes from the start of a step does not drive a face to and fro."""
+    assert still(cube(surface_count=surface_count), modulus) < 1.0e-9
+
+
+@pytest.mark.parametrize(
+    ("degrees", "seconds", "error"),
+    [(5.0, 0.5, 0.02), (1.0, 1.0, 0.03), pytest.param(0.5, 2.0, 0.05, marks=pytest.mark.rest)],
+)
+@pytest.mark.parametrize("modulus", [pytest.param(1.0e5, marks=pytest.mark.rest), 1.0e6])
+def test_balls_roll_down(modulus: float, degrees: float, seconds: float, error: float) -> None:
+    """A ball of 1,500 samples gains 5/7 g sin."""
+    body, slope = smooth_ball(), np.radians(degrees)
+
+    def populate(world: newton.ModelBuilder) -> None:
+        material = Material(youngs_modulus=modulus, density=300.0)
+        add_reduced_body(world, body, material=material, position=(0.0, 0.0, 0.05))
+
+    gravity = (GRAVITY * np.sin(slope), 0.0, -GRAVITY * np.cos(slope))
+    scene = Scene(populate, [body], gravity=gravity, ground=0.8, dt=1.0 / 240.0)
+    scene.step(60)
+    before = scene.momentum()[0][0]
+    scene.step(round(seconds * 240))
+    gained = (scene.momentum()[0][0] - before) / scene.mass() / seconds
+    assert gained == pytest.approx(5.0 / 7.0 * GRAVITY * np.sin(slope), rel=error)
+
+
+def test_tables() -> None:
+    """Neighbourhoods face one way and weigh what functions carry, a ball has the curvature 1/R, a sheet two sides."""
+    body = smooth_ball(8, 400)
+    np.testing.assert_allclose(np.median(mean_curvature(body)), 1.0 / 0.05, rtol=0.02)
+    assert np.abs(mean_curvature(cube())).max() < 1.0e-9
+    thin = sheet()
+    for samples, weights in neighbourhoods(thin):
+        assert weights.sum() == pytest.approx(CARRIED) and (weights > 0.0).all()
+        assert np.ptp(thin.surface.normals[samples] @ thin.surface.normals[samples[0]]) <= 1.5
+    assert sample_room(thin, 0.01) > 1.5 * thin.surface_count
+    assert sample_room(cube(), 0.01) == cube().surface_count

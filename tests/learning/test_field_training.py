@@ -1,0 +1,71 @@
+"""Training a field on pictures with poses; the full recipe runs in examples/train_field.py."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from softmode.deformables import quadrature_from_density
+from softmode.errors import AssetError
+from softmode.radiance import RadianceGrid, render_radiance
+from softmode.splats import Lens, PinholeCamera, read_transforms, write_transforms
+
+pytest.importorskip("torch")
+RADIUS, EDGE = 0.05, 40
+
+
+def ball(x):
+    """Return density and colour of a ball in two colours."""
+    density = 4.0e3 * np.clip(0.5 + (RADIUS - np.linalg.norm(x, axis=1)) / 0.003, 0.0, 1.0)
+    return density, np.where(x[:, 2:] > 0.0, (0.8, 0.3, 0.2), (0.2, 0.4, 0.7))
+
+
+def pictures(folder: Path, count: int) -> Path:
+    """Write pictures of the ball before white, of a lens and of wrong exposure; return their folder."""
+    field = RadianceGrid.from_function(ball, [[-0.06] * 3, [0.06] * 3], resolution=48)
+    z = np.linspace(-0.7, 0.9, count)
+    a, r = 2.4 * np.arange(count), np.sqrt(1.0 - z * z)
+    eyes = 0.25 * np.stack([r * np.cos(a), r * np.sin(a), z], axis=1)
+    cameras = [
+        PinholeCamera.look_at(f"{i}", position=tuple(eye), target=(0.0, 0.0, 0.0), width=EDGE, height=EDGE, fov_y=0.7)
+        for i, eye in enumerate(eyes)
+    ]
+    poses, c = [camera.world_to_camera for camera in cameras], cameras[0]
+    seen = render_radiance(field, poses, (c.fx, c.fy, c.cx, c.cy), width=EDGE, height=EDGE).on((1.0, 1.0, 1.0))
+    gains = np.linspace(0.9, 1.0, count)[:, None, None, None]
+    write_transforms(folder, cameras, gains * np.asarray(seen), Lens(k1=0.05))
+    return folder
+
+
+def test_a_ball_is_a_ball(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ten small pictures and coarse grids leave a solid of walls with the ball's volume to a sixth, and its colours."""
+    from softmode.learning import train_field
+
+    for name, value in {"COARSE": 24, "FINE": 32, "RAYS": 1024, "REGULAR": 1000}.items():
+        monkeypatch.setattr(f"softmode.learning.field_training.{name}", value)
+    told: list[float] = []
+    found = train_field(
+        read_transforms(pictures(tmp_path, 10)), steps=120, metres=1.0, progress=lambda _, error: told.append(error)
+    )
+    assert np.mean(told[-5:]) < 0.2 * np.mean(told[:5])
+    box = found.bounds + np.array([[-1.0], [1.0]]) * found.spacing
+    solid = quadrature_from_density(found.densities, box, surface_count=16, point_count=500)
+    assert solid.volume == pytest.approx(4.0 / 3.0 * np.pi * RADIUS**3, rel=1.0 / 6.0)
+    assert solid.report["fog"] < 0.2 and found.metres == 1.0
+    top, bottom = found.colors([[0.0, 0.0, RADIUS], [0.0, 0.0, -RADIUS]], [[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
+    assert top[0] > top[2] and bottom[2] > bottom[0]
+
+
+def test_silhouettes_without_anything_in_common(tmp_path: Path) -> None:
+    """Pictures of a wall alone, or of several sizes, are refused."""
+    from softmode.learning import train_field
+
+    cameras = [PinholeCamera.look_at(f"{i}", position=(0.3, 0.1 * i, 0.1), target=(0.0, 0.0, 0.0), width=16, height=16)
+               for i in range(3)]  # fmt: skip
+    write_transforms(tmp_path, cameras, np.ones((3, 16, 16, 3)))
+    with pytest.raises(AssetError, match="nothing in common"):
+        train_field(read_transforms(tmp_path), steps=1)
+    with pytest.raises(AssetError, match="several sizes"):
+        train_field(())
