@@ -15,21 +15,20 @@ import numpy as np
 from PIL import Image
 from scipy import ndimage
 
+from softmode import splats as gs
 from softmode.deformables import Material, status_reasons
 from softmode.learning import train_field
 from softmode.objects import Placed, SoftObject, load
 from softmode.radiance import render_radiance, write_radiance
 from softmode.scenes import SplatScene
-from softmode.splats import CameraOptions, Lens, PinholeCamera, SplatArrays, SplatRasterizer, ViewArrays
-from softmode.splats.raster.posed_pictures import read_transforms, write_transforms
 
-LENS, NOISE, BLUR, EXPOSURE = Lens(k1=0.08, k2=-0.03, p1=0.001, p2=-0.0008), 0.02, 0.5, 0.1
+LENS, NOISE, BLUR, EXPOSURE = gs.Lens(k1=0.08, k2=-0.03, p1=0.001, p2=-0.0008), 0.02, 0.5, 0.1
 """What the lens does; noise of a pixel, blur [px], to which the lens adds as much, and error of the exposure."""
 FOAM = Material(youngs_modulus=2.0e4, poissons_ratio=0.35, density=150.0, viscosity=4.0e-3)
-WHITE = CameraOptions(sky=((1.0, 1.0, 1.0),) * 2)
+WHITE = gs.CameraOptions(sky=((1.0, 1.0, 1.0),) * 2)
 
 
-def views(splats, count: int, lowest: float, turn: float, edge: int, fov: float) -> list[PinholeCamera]:
+def views(splats, count: int, lowest: float, turn: float, edge: int, fov: float) -> list[gs.PinholeCamera]:
     """Return cameras on a spiral around splats, from a height -1..1 up."""
     low, high = splats.bounds()
     middle, distance = 0.5 * (low + high), 1.5 * float(np.linalg.norm(high - low))
@@ -37,15 +36,15 @@ def views(splats, count: int, lowest: float, turn: float, edge: int, fov: float)
     a, r = turn + np.arange(count) * np.pi * (3.0 - np.sqrt(5.0)), np.sqrt(1.0 - z * z)
     eyes = middle + distance * np.stack([r * np.cos(a), r * np.sin(a), z], axis=1)
     size = {"target": tuple(middle), "width": edge, "height": edge, "fov_y": fov}
-    return [PinholeCamera.look_at(f"{i:03d}", position=tuple(eye), **size) for i, eye in enumerate(eyes)]
+    return [gs.PinholeCamera.look_at(f"{i:03d}", position=tuple(eye), **size) for i, eye in enumerate(eyes)]
 
 
-def pictures(splats, cameras: list[PinholeCamera]) -> np.ndarray:
+def pictures(splats, cameras: list[gs.PinholeCamera]) -> np.ndarray:
     """Return clean pictures before white, shape (V, height, width, 3)."""
     first = cameras[0]
-    raster = SplatRasterizer(splats.count, len(cameras), first.width, first.height)
-    seen = ViewArrays.from_cameras(cameras, world=[0] * len(cameras))
-    raster.render(SplatArrays.from_splats([splats]), seen)
+    raster = gs.SplatRasterizer(splats.count, len(cameras), first.width, first.height)
+    seen = gs.ViewArrays.from_cameras(cameras, world=[0] * len(cameras))
+    raster.render(gs.SplatArrays.from_splats([splats]), seen)
     return raster.rgb.numpy() + 1.0 - raster.alpha.numpy()[..., None]
 
 
@@ -58,7 +57,7 @@ def psnr(one: np.ndarray, other: np.ndarray) -> float:
 def pulled(thing: SoftObject, edge: int) -> tuple[list[np.ndarray], list[float], list[str]]:
     """Return pictures at rest, pulled to 1.25 of the height and squeezed to 0.8, heights over that, and what broke."""
     size = {"target": (0.0, 0.0, 0.0), "width": edge, "height": edge, "fov_y": 0.62}
-    camera = PinholeCamera.look_at("film", position=(0.2, -0.26, 0.1), **size)
+    camera = gs.PinholeCamera.look_at("film", position=(0.2, -0.26, 0.1), **size)
     still = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
     scene = SplatScene(still, [Placed(object=thing)], cameras=[camera], camera_options=WHITE, grip_slots=24, march=True)
     points = thing.body.surface.points
@@ -99,9 +98,9 @@ def main() -> None:
     cameras, held = views(splats, count, -0.3, 0.0, edge, 0.7), views(splats, 10, -0.2, 1.0, edge, 0.7)
     seen = ndimage.gaussian_filter(pictures(splats, cameras), (0.0, BLUR, BLUR, 0.0))
     seen = seen * (1.0 + EXPOSURE * rng.uniform(-1.0, 1.0, (count, 1, 1, 1))) + NOISE * rng.normal(size=seen.shape)
-    write_transforms(given.folder, cameras, seen, LENS)
+    gs.write_transforms(given.folder, cameras, seen, LENS)
     clock = time.process_time()
-    field = train_field(read_transforms(given.folder), steps=steps, metres=1.0)
+    field = train_field(gs.read_transforms(given.folder), steps=steps, metres=1.0)
     print(f"trained {steps} steps on {count} pictures of {edge} px in {time.process_time() - clock:.0f} s of a core")
     write_radiance(given.folder / "field.npz", field)
     lens, poses = (held[0].fx, held[0].fy, held[0].cx, held[0].cy), [camera.world_to_camera for camera in held]

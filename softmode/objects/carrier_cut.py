@@ -14,10 +14,12 @@ from scipy.spatial.transform import Rotation
 from softmode.objects.carriers import (
     LIKELY,
     SURE,
+    WIDE,
     Boundary,
     Sections,
     Surface,
     best_axis,
+    filled,
     find_boundaries,
     heavy,
     weighted_median,
@@ -63,10 +65,10 @@ def cut_at(sections: Sections, boundary: Boundary, gap: float) -> Cut:
     x, normal, pitch = surface.points, surface.normals, surface.pitch
     i, j = sections.cells_of(x)
     height, shift, reach, rough = x[:, 2] - boundary.height, np.zeros(3), 0.5 * sections.layer, False
+    span = max((boundary.reach + 1.5) * sections.layer, 0.03 * sections.size)
+    within: Any = ndimage.binary_dilation(contact, iterations=2)
+    outside = ~within[i, j]
     if boundary.kind == "top":
-        span = max((boundary.reach + 1.5) * sections.layer, 0.03 * sections.size)
-        within: Any = ndimage.binary_dilation(contact, iterations=2)
-        outside = ~within[i, j]
         flat = np.flatnonzero(outside & (np.abs(height) < span) & (np.abs(normal[:, 2]) > 0.8))
         spread = 0.5 * pitch
         if len(flat) > 10:
@@ -79,11 +81,18 @@ def cut_at(sections: Sections, boundary: Boundary, gap: float) -> Cut:
             height, shift[2] = height - top, shift[2] + top
             spread = weighted_median(np.abs(height[near]), surface.areas[near])
         reach, rough = float(np.clip(4.0 * spread, 0.3 * pitch, span)), spread > 0.5 * pitch
+    above = height > 0.0
     lying = (np.abs(height) <= reach) & (np.abs(normal[:, 2]) > 0.75)
     if rough:
         core: Any = ndimage.binary_erosion(contact, iterations=2)
-        lying &= ~(core[i, j] & (height > 0.3 * reach))
-    above = (height > 0.0) & ~lying
+        covered: Any = sections.solid[sections.layer_of(boundary.height + 2.0 * span) :].any(axis=0)
+        low = (np.abs(height) < 2.0 * span) & (np.abs(normal[:, 2]) > 0.8) & ~covered[i, j]
+        sheet = _sheet(surface, np.flatnonzero(low), outside)
+        lying = (lying & ~(core[i, j] & (height > 0.3 * reach))) | sheet
+        foot, stands = np.zeros_like(contact), above & ~sheet & (height < 2.0 * span)
+        foot[i[stands], j[stands]] = True
+        contact = contact & filled(ndimage.binary_dilation(foot, WIDE))
+    above &= ~lying
     kept = np.flatnonzero(above)
     if len(kept) > 50:
         wide = kept[np.linalg.norm(surface.tangents[kept, :, 1], axis=1) > 0.4 * gap]
@@ -98,6 +107,18 @@ def cut_at(sections: Sections, boundary: Boundary, gap: float) -> Cut:
     floor = np.column_stack([plan, boundary.height + plan @ shift[:2] + shift[2]])
     beneath, place = ~above & (height < reach), floor @ sections.basis
     return Cut(above=above, beneath=beneath, floor=place, cell=sections.cell, axis=sections.basis[2])
+
+
+def _sheet(surface: Surface, level: NDArray[np.intp], outside: Mask) -> Mask:
+    """Return which splats belong to an uneven top: level ones that hang together with those outside the contact.
+
+    A bump that touches what stands there is part of it; a foot is not, whose sides are steep.
+    """
+    label = link_labels(surface.points[level], 1.2 * surface.pitch)
+    free = np.bincount(label, surface.areas[level] * outside[level])
+    found = np.zeros(len(outside), dtype=bool)
+    found[level] = (free >= 0.2 * free.sum())[label]
+    return found
 
 
 def _plane(points: Array, height: Array, areas: Array, span: float, least: float) -> Array:

@@ -16,6 +16,7 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull, KDTree
 
 from softmode.deformables.quadrature.shell_views import spread_samples
+from softmode.splats.components import surface_discs
 from softmode.splats.splats import Splats
 
 Array = NDArray[np.float64]
@@ -49,7 +50,7 @@ class Surface:
     @classmethod
     def of(cls, splats: Splats) -> Surface:
         """Return the discs of splats."""
-        points, (normals, tangents) = splats.means.astype(np.float64), splats.discs()
+        points, (normals, tangents) = splats.means.astype(np.float64), surface_discs(splats)
         areas = splats.opacities * np.linalg.norm(tangents, axis=1).prod(axis=1)
         few: Any = KDTree(points).query(points[:: max(1, len(points) // 20_000)], k=min(7, len(points)))
         return cls(
@@ -327,8 +328,11 @@ class Sections:
             "smaller": ramp(-float(above.sum() / below.sum()), -0.95, -0.85),
             "enough": ramp(share, 0.02, 0.06) * ramp(held, 0.01, 0.04) * ramp(most, 0.18, 0.35),
         }
-        # A boxy thing on a box may be the hood of a car: a doubt is named.
-        score = min(float(np.prod(list(why.values()))), 0.99 * SURE if plain_above > 0.9 else 1.0)
+        # A boxy thing on a box may be the hood of a car, and a slight foot that of a handle: a doubt is named.
+        unsure = plain_above > 0.9 or above.sum() < 0.03 * below.sum()
+        score = min(float(np.prod(list(why.values()))), 0.99 * SURE if unsure else 1.0)
+        if score < LIKELY and np.prod([part for name, part in why.items() if name != "free"]) > 0.9:
+            score = max(score, 1.5 * DOUBTED * ramp(around + 0.3 * contrast, 0.55, 0.65))  # all else speaks for it
         named = {"convexity": convex, "plain_above": plain_above}
         top = Boundary(kind="top", height=float(self.heights[k]), score=score, contact=above, reach=reach, **named)
         return [top]
@@ -356,7 +360,8 @@ class Sections:
                 "not turned": ramp(-self.turned_share, -0.85, -0.7),
                 "enough": ramp(float(self.areas[end:].sum() / self.areas.sum()), 0.1, 0.3),
             }
-            score, height = float(np.prod(list(why.values()))), float(self.heights[end])
+            # A mushroom stands on a stem of its own: a doubt is named.
+            score, height = min(float(np.prod(list(why.values()))), 0.99 * SURE), float(self.heights[end])
             found.append(Boundary(kind="stem", height=height, score=score, contact=self.solid[end]))
         return sorted(found, key=lambda stem: -stem.score)[:1]
 
@@ -369,7 +374,7 @@ def is_step(sections: Sections, lower: Boundary, upper: Boundary) -> bool:
     first, last = sections.layer_of(lower.height), sections.layer_of(upper.height)
     between = [convexity(mask) for mask in sections.solid[first + 3 : last - 2] if mask.any()]
     convex = float(np.median(between)) if between else 0.0
-    if last - first < 10:
+    if last - first < 0.25 * len(sections.solid):  # the faces of a low step may be too bare for sections
         convex = max(convex, upper.convexity)
     plain, _, _ = sections.look(lower.height + sections.layer, upper.height + sections.layer)
     return convex > 0.8 and plain > 0.6 and plain - upper.plain_above > 0.15

@@ -8,12 +8,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
-from scipy.spatial import KDTree
+from scipy.spatial import ConvexHull, KDTree
 
 from softmode.errors import ConfigError
 from softmode.objects.carrier_cut import WHOLE, divide
-from softmode.objects.rooms import crop_of, scene_crop
-from softmode.splats.components import label_components, size_of
+from softmode.objects.rooms import ALIKE, BESIDE, crop_of, scene_crop
+from softmode.splats.components import label_components, size_of, surface_discs
 from softmode.splats.splats import Splats, joined
 
 Rule = Literal["thickest", "tallest", "largest", "all"]
@@ -23,6 +23,8 @@ GROUND_SHARE = 0.05
 """Least share of a capture's area that can be ground."""
 GROUND_COVER = 0.5
 """Of ground less than this has anything above it: the side of a solid has the other side behind it."""
+GROUND_UNDER = 0.5
+"""Of all else at least this lies over the ground."""
 SURROUNDED = 0.05
 """A part with this share of another's splats, in the middle of it, is the object and the other one a room."""
 CANDIDATES = 9
@@ -39,7 +41,8 @@ class Choice:
     """Its splats in the capture, in its order; what closes it comes after them."""
     number: NDArray[np.intp]
     """Number of the candidate that each splat of the capture belongs to, from 1 on, shape (N,); 0 for the ground and
-    floaters. The first is the topmost piece of the object's part, the next carry it, others are parts of their own."""
+    floaters. The first is the topmost piece of the object's part, the next carry it, others are parts of their own or
+    stand beside it on what carries it."""
     taken: tuple[int, ...]
     """The candidates that are taken."""
     told: dict[str, str | int | float]
@@ -82,13 +85,16 @@ def choose_part(splats: Splats, rule: Part) -> Choice:
         chosen = first = max(order, key=lambda k: _thickness(things[k]))
         while ground is not None and (inner := [k for k in order if _surrounds(things[chosen], things[k])]):
             chosen = max(inner, key=lambda k: _thickness(things[k]))
-    number, others = np.zeros(splats.count, dtype=np.intp), [k for k in order if k != chosen]
+    number, others = np.zeros(splats.count, dtype=np.intp), [parts[k] for k in order if k != chosen]
     pieces = WHOLE
     if rule not in ("largest", "tallest"):
         pieces = divide(things[chosen], None if ground is None else ground.normal, gap)
     number[parts[chosen]] = pieces.number
-    for k, mark in zip(others, range(pieces.count + 1, CANDIDATES + 1), strict=False):
-        number[parts[k]] = mark
+    above = np.flatnonzero((number > 0) & (number <= pieces.top))
+    beside = _beside(splats, above, gap) if pieces.top < pieces.count else []
+    others = [*beside, *others]
+    for rows, mark in zip(others, range(pieces.count + 1, CANDIDATES + 1), strict=False):
+        number[rows] = mark
     taken = rule if isinstance(rule, tuple) else tuple(range(1, pieces.top + 1))
     if missing := set(taken) - set(number.tolist()):
         raise ConfigError(
@@ -96,17 +102,28 @@ def choose_part(splats: Splats, rule: Part) -> Choice:
             hint="`softmode splat show FILE` draws them with their numbers",
         )
     part, rows = things[chosen], parts[chosen]
-    if set(taken) != set(range(1, pieces.count + 1)):
+    if beside or set(taken) != set(range(1, pieces.count + 1)):
         rows = np.flatnonzero(np.isin(number, taken))
-        part = joined([splats.subset(rows), *pieces.floors(set(taken), things[chosen])], splats.name)
+        standing = {pieces.top} if any((number[one] == mark).any() for one in beside for mark in taken) else set()
+        floors = pieces.floors({*taken, *standing}, things[chosen])
+        if beside and floors:  # each thing has the floor that is nearest to it
+            near = KDTree(things[chosen].means)
+            mine = np.isin(number[parts[chosen]], taken)
+            floors = [floor.subset(mine[near.query(floor.means)[1]]) for floor in floors]
+        part = joined([splats.subset(rows), *floors], splats.name)
     told: dict[str, str | int | float] = {"part_splats": len(rows), "floor_splats": part.count - len(rows)}
     told["ground_splats"] = int(floor.sum())
-    other = next((things[k] for k in others if things[k].count >= SURROUNDED * things[chosen].count), None)
+    other = next((rows for rows in others if len(rows) >= SURROUNDED * things[chosen].count), None)
     if other is not None:
-        told |= {"other_splats": other.count, "other_crop": crop_of(other), "other_part": pieces.count + 1}
+        crop = crop_of(splats.subset(other))
+        told |= {
+            "other_splats": len(other),
+            "other_crop": crop,
+            "other_part": int(number[other[0]] or pieces.count + 1),
+        }
     if rule == "thickest":
         told |= pieces.told
-        rest, within = [things[k] for k in others], first != chosen
+        rest, within = [splats.subset(rows) for rows in others], first != chosen
         if crop := scene_crop(things[chosen], rest, within=within, grounded=ground is not None):
             told["scene_crop"] = crop
     return Choice(part=part, rows=rows, number=number, taken=taken, told=told)
@@ -120,6 +137,17 @@ def _linked(scene: Splats) -> tuple[float, NDArray[np.intp]]:
     pitch = 1.5 * np.median(KDTree(scene.means).query(few, k=min(7, scene.count))[0][:, -1])
     gap = max(0.015 * size_of(scene), float(pitch), 1.0e-9)
     return gap, label_components(scene, gap=gap, faces=True)
+
+
+def _beside(splats: Splats, above: NDArray[np.intp], gap: float) -> list[NDArray[np.intp]]:
+    """Return of the rows (M,) that stand on a carrier those of things of weight beside the thickest one."""
+    label = label_components(splats.subset(above), gap=gap, faces=True)
+    found = [above[label == k] for k in range(int(label.max(initial=-1)) + 1)]
+    things = [splats.subset(rows) for rows in found]
+    heavy = [k for k, thing in enumerate(things) if thing.count >= BESIDE * things[0].count]
+    heavy = [k for k in heavy if size_of(things[k]) >= ALIKE * size_of(things[0])]
+    heavy.sort(key=lambda k: -_thickness(things[k]))
+    return [found[k] for k in heavy[1:]]
 
 
 def _surrounds(part: Splats, inner: Splats) -> bool:
@@ -144,7 +172,7 @@ def find_ground(splats: Splats) -> Ground | None:
     if len(solid) < 200:
         return None
     firm = splats.subset(solid)
-    x, size, (normal, tangents) = firm.means.astype(np.float64), size_of(firm), firm.discs()
+    x, size, (normal, tangents) = firm.means.astype(np.float64), size_of(firm), surface_discs(firm)
     area = np.linalg.norm(tangents, axis=1).prod(axis=1)
     area = np.minimum(area, np.quantile(area, 0.99))
     few = np.random.default_rng(0).permutation(len(solid))[:3000]
@@ -174,6 +202,11 @@ def find_ground(splats: Splats) -> Ground | None:
     side = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
     side /= np.linalg.norm(side)
     plan = (x - middle) @ np.stack([side, np.cross(axis, side)], axis=1)
+    # What stands on it stands over it: else it is a strip of a round side.
+    hull = ConvexHull(plan[flat])
+    within = (plan[rest] @ hull.equations[:, :2].T + hull.equations[:, 2]).max(axis=1) < 0.0
+    if within.mean() < GROUND_UNDER:
+        return None
     # Cells that hold ten splats of the plane on average; holes between them do not count.
     cell = max(float(np.sqrt(10.0 * np.ptp(plan[flat], axis=0).prod() / flat.sum())), 0.01 * size)
     edges = [np.arange(along.min(), along.max() + cell, cell) for along in plan.T]

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from softmode.splats.components import label_components, size_of
+from softmode.splats.components import label_components, size_of, surface_discs
 from softmode.splats.splats import Splats
 
 Array = NDArray[np.float64]
@@ -51,7 +51,7 @@ def _inside_of_walls(part: Splats) -> Splats | None:
     if solid.count < 500:
         return None
     x = solid.means.astype(np.float64)
-    upright = np.abs(solid.discs()[0][:, 2]) < 0.3
+    upright = np.abs(surface_discs(solid)[0][:, 2]) < 0.3
     low, high = np.quantile(x, [0.01, 0.99], axis=0)
     plan = x[:, :2][((x > low) & (x < high))[:, :2].all(axis=1)]
     x_edge, y_edge, z_edge = high - low

@@ -104,6 +104,31 @@ def _disc_points(splats: Splats, gap: float, widest: float) -> NDArray[np.float3
     return disc_points(splats.means[flat], splats.discs()[1][flat], gap)
 
 
+def surface_discs(splats: Splats) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the discs of splats (`Splats.discs`), those of thick ones turned into the surface around them.
+
+    A sphere or a rod has a thin axis by chance: its disc lies in the plane of its neighbours.
+    """
+    normals, tangents = splats.discs()
+    thin, wide, long = np.sort(splats.scales, axis=1).T
+    thick = np.flatnonzero(thin > 0.6 * wide)
+    if len(thick) == 0 or splats.count < 16:
+        return normals, tangents
+    around = splats.means[KDTree(splats.means).query(splats.means[thick], k=16)[1]].astype(np.float64)
+    around -= around.mean(axis=1, keepdims=True)
+    facing = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))[1][:, :, 0]
+    length = np.linalg.norm(tangents[thick], axis=1)
+    first = tangents[thick, :, 0] / length[:, :1]
+    rod = (wide < 0.6 * long)[thick]
+    facing[rod] -= (facing[rod] * first[rod]).sum(axis=1, keepdims=True) * first[rod]
+    facing /= np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), 1e-12)
+    first = first - (first * facing).sum(axis=1, keepdims=True) * facing
+    first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-12)
+    normals[thick] = facing
+    tangents[thick] = np.stack([first, np.cross(facing, first)], axis=2) * length[:, None]
+    return normals, tangents
+
+
 def disc_points(means: NDArray[Any], tangents: NDArray[Any], gap: float) -> NDArray[np.float32]:
     """Return points about a gap apart on discs of one and a half tangents (N, 3, 2) around centres (N, 3)."""
     found = [np.zeros((0, 3))]

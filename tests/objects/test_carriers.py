@@ -5,8 +5,11 @@ Builds captures, which is what it tests.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from benchmarks.carriers import SEEDS, judge
 from softmode.deformables.quadrature.quadrature import quadrature_from_splats
@@ -16,7 +19,7 @@ from softmode.objects.parts import choose_part, find_ground
 from softmode.objects.pipeline import standing_quadrature
 from softmode.objects.source import object_source
 from tests.captures import merged, render_shell, sheet, toy
-from tests.carriers import CARRIER, OBJECT, SETS, bare, carried, room
+from tests.carriers import CARRIER, OBJECT, SETS, bare, bear, box, carried, render, room, vase
 
 FEW = 8_000
 """Splats of a capture in the quick tests."""
@@ -49,6 +52,24 @@ def test_a_block_with_a_handle_stays_whole() -> None:
     assert np.isin(choice.number, choice.taken)[made.label == OBJECT].mean() > 0.97
 
 
+def test_of_two_things_on_one_carrier_one_is_taken() -> None:
+    """A bear and a vase on a box: one of them, closed below, and the other as a candidate with a floor of its own."""
+    left, right, below = bear(), vase(), box(2.2, 1.2, 0.5, at=(0, 0, -0.25))
+    below.label = CARRIER
+    for shape, way in ((left, -0.6), (right, 0.6)):
+        for solid in shape:
+            solid.at[0] += way
+    made = render([*left, *right, below], "two", np.random.default_rng(6), count=2 * FEW)
+    one = choose_part(made.splats, "thickest")
+    other = choose_part(made.splats, (int(one.told["other_part"]),))
+    for choice in (one, other):
+        low, high = choice.part.bounds()[:, 0]
+        assert low > 0.0 or high < 0.0
+        assert int(choice.told["floor_splats"]) > 0
+        assert (made.label[choice.rows] == OBJECT).mean() > 0.99
+    assert len(one.rows) + len(other.rows) > 0.97 * (made.label == OBJECT).sum()
+
+
 def test_a_room_is_named() -> None:
     """A room comes with a crop that holds some of it."""
     made = room(700, count=20_000)
@@ -58,13 +79,22 @@ def test_a_room_is_named() -> None:
 
 
 def test_the_fullest_of_two_planes_is_the_ground() -> None:
-    """Of a wide sheet and a smaller one a little above it, only the wide one is the ground."""
+    """Of a wide sheet and a smaller one a little above it, only the wide one is the ground; so it is of spheres."""
     wide, small = sheet(0.5, 0.5, 3e-3), sheet(0.16, 0.16, 3e-3, seed=1).transformed(translation=(0.0, 0.0, 6e-3))
     thing = render_shell(toy(), 4000).transformed(translation=(0.0, 0.0, 6e-3))
-    ground = find_ground(merged(wide, small, thing))
-    assert ground is not None and ground.normal[2] == pytest.approx(1.0, abs=1e-3)
-    assert ground.splats[: wide.count].mean() > 0.95
-    assert ground.splats[wide.count : wide.count + small.count].mean() < 0.05
+    scene = merged(wide, small, thing)
+    radius = np.sort(scene.scales, axis=1)[:, 1:2]
+    spheres = replace(scene, scales=np.repeat(radius, 3, axis=1), quats=Rotation.random(scene.count, 0).as_quat())
+    for seen in (scene, spheres):
+        ground = find_ground(seen)
+        assert ground is not None and ground.normal[2] == pytest.approx(1.0, abs=1e-3)
+        assert ground.splats[: wide.count].mean() > 0.95
+        assert ground.splats[wide.count : wide.count + small.count].mean() < 0.05
+
+
+def test_a_strip_of_a_round_side_is_no_ground() -> None:
+    """All of a bell lies on one side of a strip of it, but not over it."""
+    assert find_ground(bare(7, count=FEW).splats) is None
 
 
 def test_bad_captures_are_refused() -> None:
