@@ -80,7 +80,7 @@ def bombs() -> dict[str, tuple[bytes, str]]:
         "points@ on a line.npz": (packed(points=npy(line)), ""),
         "paint@.npz": (packed(points=points, factors=npy(zeros)), "unpacks to"),
         "recording@.npz": (packed(q=npy(zeros)), "unpacks to"),
-        "radiance@.npz": (packed(density=npy(zeros), bounds=npy(np.zeros((2, 3)))), "unpacks to"),
+        "radiance@.npz": (packed(density=npy(np.zeros(192 << 20, "u1")), bounds=npy(np.zeros((2, 3)))), "unpacks to"),
         "radiance@ of links.npz": (
             packed(
                 links=npy(np.full((220, 220, 220), -1, "<i4")), density_data=npy(np.ones((1, 1))),

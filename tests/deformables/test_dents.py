@@ -129,6 +129,15 @@ def test_hertz(youngs_modulus: float) -> None:
         assert press.force(depth) == pytest.approx(hertz(depth, youngs_modulus), rel=0.15), share
 
 
+def settled(press: Press, force: float) -> float:
+    """Return the force [N] once the ball lies still, 40 steps later it is the same."""
+    for _ in range(20):
+        before, force = force, press.held()
+        if abs(force - before) < 1.0e-6 * force:
+            break
+    return force
+
+
 def test_follows_parameters() -> None:
     """The force goes with E as it is now, and at equal d / R with the square of the scale; to what float32 leaves.
 
@@ -136,14 +145,14 @@ def test_follows_parameters() -> None:
     such poses the force differs by 0.2 %. With and without AVX-512 1.5e-6 was seen.
     """
     press, depth = Press(smooth_ball(), RADIUS), 0.04 * RADIUS
-    force = press.force(depth, 80)
+    force = settled(press, press.force(depth, 80))
     rest = press.scene.q() + smooth_ball().linear_coordinates[:, :3]
     press.scene.set_parameter("youngs_modulus", 3.0e6)
-    assert press.held() == pytest.approx(3.0 * force, rel=4.0e-6)
+    assert settled(press, press.held()) == pytest.approx(3.0 * force, rel=4.0e-6)
     half = Press(smooth_ball(), RADIUS, scale=0.5)
     half.start(0.5 * depth)
     half.scene.set(q=0.5 * rest - smooth_ball().linear_coordinates[:, :3], qd=np.zeros_like(rest))
-    assert half.held() == pytest.approx(0.25 * force, rel=4.0e-6)
+    assert settled(half, half.held()) == pytest.approx(0.25 * force, rel=4.0e-6)
 
 
 def test_two_spheres() -> None:

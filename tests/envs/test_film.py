@@ -47,7 +47,7 @@ def test_what_a_film_shows(lift: Any) -> None:
     """Of the lifted glove nine tenths are free of fingers, it fills over 15 % of the first picture and gives way.
 
     Strain at the grasp is over 8 %, some point of it swings by over 4 mm under the hand. The second picture has the
-    whole arm. The first camera moves by less than 9 cm in 0.17 s.
+    whole arm. The first camera moves by less than 11 cm in 0.17 s.
     """
     task = lift.unwrapped.task
     scene, film = task.scene, task.scene.film
@@ -68,7 +68,7 @@ def test_what_a_film_shows(lift: Any) -> None:
                 assert (where > -0.02).all() and (where < 1.02).all()
             place = -film._matrices[0][:3, :3].T @ film._matrices[0][:3, 3]
             if before is not None and step > 60:  # the turn to the fingers is over
-                assert np.linalg.norm(place - before) < 0.09
+                assert np.linalg.norm(place - before) < 0.11
             before = place
             if not policy._grasp.holds:
                 continue

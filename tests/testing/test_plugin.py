@@ -148,13 +148,13 @@ def test_the_marker_judges_by_wilsons_interval(installed: pytest.Pytester) -> No
 
 PLAYED = """
 import numpy as np
-from softmode.testing import assert_max_penetration
+from softmode.testing import assert_success
 
 def env_of(soft_env):
     return soft_env("softmode/PressSoft-v0", max_episode_steps=12, render_size=64)
 
-def test_depth(softmode_env, softmode_episode):
-    assert_max_penetration(softmode_episode(env_of(softmode_env), "scripted", 1), 0.001)
+def test_press(softmode_env, softmode_episode):
+    assert_success(softmode_episode(env_of(softmode_env), "scripted", 1))
 
 def test_policy(softmode_env, softmode_episode):
     def policy(observation):
@@ -187,7 +187,7 @@ def test_the_page_runs_and_failures_lie_beside_the_report(
     result = installed.runpytest_subprocess("--junitxml=out/report.xml", "-n", "2", "--softmode-golden", "update")
     result.assert_outcomes(passed=3, failed=2)
     kept = installed.path / "out" / "report-episodes"
-    for name in ("test_played.py_test_depth-seed1", "test_played.py_test_policy-seed0"):
+    for name in ("test_played.py_test_press-seed1", "test_played.py_test_policy-seed0"):
         assert {file.name for file in (kept / name).iterdir()} >= {"film.mp4", "episode.rrd", "before.npz"}
     result.stdout.fnmatch_lines([f"film: {kept}/*/film.mp4"])
     failures = ET.parse(installed.path / "out" / "report.xml").getroot().iter("failure")
