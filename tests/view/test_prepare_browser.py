@@ -137,6 +137,6 @@ def test_gizmos_in_a_browser_prepare_what_is_shown(tmp_path: Path) -> None:
     box = (crop[0], crop[1], crop[2], crop[3], crop[4], crop[5])
     built = object_source(ObjectConfig(splat=file, up="+x", crop=box, size=0.08)).splats
     assert 0.3 * 800 < built.count < 0.8 * 800
-    assert len(shown) == built.count
+    assert 0.98 * built.count < len(shown) <= built.count  # splats at the cut may have no solid under them
     seen, whole = np.ptp(shown, axis=0), np.ptp(built.means, axis=0)  # the page's unit is that of the splats
     np.testing.assert_allclose(seen / seen.max(), whole / whole.max(), atol=0.02)  # it hangs
