@@ -145,7 +145,7 @@ def print_lift(youngs_modulus: float) -> None:
         depth.append(-1e3 * np.where(touched, soft.view.samples.gap.numpy()[0], 0.0).min())
         iterations.append(int(soft.iteration.numpy()[0]))
 
-    task: Any = env.unwrapped.task
+    task: Any = env.task
     scene.solver.step, task.step = watched, task._step  # not as a graph, whose substeps nobody sees
     info: dict[str, Any] = {}
     for _ in range(LIFT_STEPS):
