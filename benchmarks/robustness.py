@@ -8,14 +8,14 @@ seeds. Policies that were trained without delay do not see the last actions.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
-from softmode.envs.disturbances import LIMITS
+from softmode.envs.disturbances import LIMITS, neutral
 from softmode.learning.intervals import wilson_interval
 from softmode.learning.policy import EVALUATION_SEED, Policy, load_policy
 
@@ -47,11 +47,6 @@ def rows(table: Mapping[str, Any]) -> list[tuple[str, str, dict[str, Any]]]:
     return found
 
 
-def neutral(name: str) -> float:
-    """Return the value of a disturbance that changes nothing."""
-    return 1.0 if name in ("gain", "effort") else 0.0
-
-
 def worlds_of(policy: Policy, count: int, **options: Any) -> Any:
     """Return worlds of the policy's environment in which all disturbances can be set."""
     on = {f"{name}_range": (neutral(name), max(neutral(name), 3.0 * ("delay" in name))) for name in LIMITS}
@@ -72,12 +67,17 @@ def play(env: Any, policy: Policy, options: Mapping[str, Any], seed: int) -> dic
     hidden = np.r_[segments["last_actions"][0]]
     if observation.shape[1] == policy.interface.vectors["state"]:
         hidden = hidden[:0]
-    alive, found = np.ones(count, bool), {}
+    return last_infos(env, lambda seen: policy(np.delete(seen, hidden, axis=1)), observation)
+
+
+def last_infos(env: Any, player: Callable[[Any], Any], observation: Any) -> dict[str, np.ndarray]:
+    """Play an episode that has begun in every world, none of which begins anew; return what the last infos say."""
+    alive, found = np.ones(env.num_envs, bool), {}
     while alive.any():
-        observation, _, terminated, truncated, infos = env.step(policy(np.delete(observation, hidden, axis=1)))
+        observation, _, terminated, truncated, infos = env.step(player(observation))
         ended = alive & (terminated | truncated)
         for name in ("is_success", "is_safe_success", "peak_force"):
-            found.setdefault(name, np.zeros(count))[ended] = np.asarray(infos[name], float)[ended]
+            found.setdefault(name, np.zeros(env.num_envs))[ended] = np.asarray(infos[name], float)[ended]
         alive &= ~ended
     return found
 

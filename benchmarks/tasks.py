@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
 
 import softmode
 from softmode.learning.intervals import wilson_interval
@@ -91,6 +90,7 @@ def page(rows: list[dict[str, str]]) -> str:
 
 def play(task: str, policy: str, episodes: int, seed: int, device: str | None) -> tuple[int, int]:
     """Return in how many episodes a policy succeeded, and in how many safely."""
+    from benchmarks.robustness import last_infos
     from softmode.envs import scripted_policy
     from softmode.learning.policy import load_policy
 
@@ -99,15 +99,9 @@ def play(task: str, policy: str, episodes: int, seed: int, device: str | None) -
     env: Any = gym.make_vec(IDS[task], num_envs=episodes, autoreset_mode="Disabled", device=device, **options)
     player: Any = scripted_policy(env) if trained is None else trained
     observation, _ = env.reset(seed=seed)
-    alive, found = np.ones(episodes, bool), np.zeros((2, episodes), bool)
-    while alive.any():
-        observation, _, terminated, truncated, infos = env.step(player(observation))
-        ended = alive & (terminated | truncated)
-        for k, name in enumerate(("is_success", "is_safe_success")):
-            found[k, ended] = infos[name][ended]
-        alive &= ~ended
+    found = last_infos(env, player, observation)
     env.close()
-    return int(found[0].sum()), int(found[1].sum())
+    return int(found["is_success"].sum()), int(found["is_safe_success"].sum())
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import linecache
 import re
 from pathlib import Path
@@ -16,6 +15,7 @@ from softmode.errors import LanesError
 from softmode.lanes import LANES, lanes_code
 from tests import lanes_refused_kernels as refused
 from tests.lanes_kernels import FUNCTIONS, eight_at_a_time, one_at_a_time, vec8d
+from tests.modules import load
 
 WRITTEN: Any = FUNCTIONS  # device functions, which a type checker takes for Python's
 NAMES = [*(function.key for function in WRITTEN), "of_struct", "log"]
@@ -82,7 +82,7 @@ def test_native_code_is_refused() -> None:
 
 def test_two_functions_of_one_name_are_refused(tmp_path: Path) -> None:
     """A law that calls two functions of one name would have one of them called for both."""
-    modules = [load(tmp_path / f"{name}.py", SOURCE) for name in ("first", "second")]
+    modules = [written(tmp_path / f"{name}.py", SOURCE) for name in ("first", "second")]
     with pytest.raises(LanesError, match="two device functions are called twice"):
         lanes_code(*(module.twice for module in modules))
 
@@ -95,19 +95,15 @@ def twice(x: wp.float64):
 """
 
 
-def load(path: Path, source: str):
+def written(path: Path, source: str):
     """Return a module of a file that is written here."""
     path.write_text(source)
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    assert spec and spec.loader
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load(path)
 
 
 def test_without_its_source_a_function_is_refused(tmp_path: Path) -> None:
     """As in a frozen application that ships no .py files."""
-    module = load(tmp_path / "frozen.py", SOURCE)
+    module = written(tmp_path / "frozen.py", SOURCE)
     assert "twice" in lanes_code(module.twice)
     (tmp_path / "frozen.py").unlink()
     linecache.clearcache()

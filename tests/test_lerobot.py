@@ -2,34 +2,25 @@
 
 from __future__ import annotations
 
-import importlib.util
 import shutil
 import subprocess
 import sys
 import zipfile
 from email.parser import Parser
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
+from tests.modules import load
+
 PACKAGE = Path(__file__).resolve().parents[1] / "packages" / "lerobot_env_softmode"
-
-
-def worlds_module() -> Any:
-    """Return the module that needs no LeRobot, which is not installed here."""
-    spec = importlib.util.spec_from_file_location("worlds", PACKAGE / "lerobot_env_softmode" / "worlds.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.mark.parametrize("obs_type", ["state", "pixels_agent_pos"])
 def test_worlds_are_as_the_loops_of_lerobot_expect(obs_type: str, capsys: pytest.CaptureFixture[str]) -> None:
     """Names, batches, pictures of every world, the reset's mark; success by both rules is counted and said."""
-    module = worlds_module()
+    module = load(PACKAGE / "lerobot_env_softmode" / "worlds.py")  # it needs no LeRobot, which is not installed here
     options = {} if obs_type == "state" else {"image_size": 36}
     env = module.make_worlds(
         "softmode/LiftSoft-v0", 2, camera="front", obs_type=obs_type, max_episode_steps=2, **options

@@ -31,8 +31,7 @@ class RadianceInfo:
         low, high = field.bounds
         density = field.density[field.occupied if field.occupied.any() else field.density > 0.0].astype(float)
         deciles = np.quantile(density, [0.1, 0.5, 0.9])
-        box = field.bounds + np.array([[-1.0], [1.0]]) * field.spacing
-        solid = quadrature_from_density(field.densities, box, surface_count=16)
+        solid = quadrature_from_density(field.densities, field.surroundings, surface_count=16)
         fog, unit = float(solid.report["fog"]), "not known" if field.metres is None else f"{field.metres:.4g} m"
 
         def row(values: object) -> str:

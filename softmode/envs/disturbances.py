@@ -43,6 +43,11 @@ _SCALES |= {"object_velocity": 0.02, "arm": 1e-3, **dict.fromkeys(_EXACT, 0.0)}
 """Standard deviations at noise or bias 1 in the unit of the segment; 2 mm for those that are not named."""
 
 
+def neutral(name: str) -> float:
+    """Return the value of a disturbance that changes nothing."""
+    return 1.0 if name in ("gain", "effort") else 0.0
+
+
 def disturbance_parameters(config: Any) -> tuple[Parameter, ...]:
     """Return what is drawn for the disturbances if any is on; a reset may set delays up to the longest of the range."""
     given = {name: getattr(config, f"{name}_range") for name in LIMITS}
@@ -50,7 +55,7 @@ def disturbance_parameters(config: Any) -> tuple[Parameter, ...]:
         return ()
     made = []
     for name, (least, most) in LIMITS.items():
-        low, high = given[name] or ((1.0, 1.0) if name in ("gain", "effort") else (0.0, 0.0))
+        low, high = given[name] or (neutral(name),) * 2
         most = high if "delay" in name else most
         made.append(Parameter(name=name, low=(low,), high=(high,), least=(least,), most=(most,)))
     return tuple(made)

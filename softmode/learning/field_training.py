@@ -117,7 +117,7 @@ def train_field(
     density = np.where(s > 0.0, tail, 1.0 - tail) * (len(s) - 1) / (2.0 * half * beta)
     box = np.stack([middle - half, middle + half])
     field = RadianceGrid.from_bounds(density, c[..., None, :], box, name="trained field", metres=metres)
-    return field.cropped(*(field.bounds + np.array([[-1.0], [1.0]]) * field.spacing))
+    return field.cropped(*field.surroundings)
 
 
 def _cube(pictures: Sequence[PosedPicture]) -> tuple[Array, float]:

@@ -26,7 +26,7 @@ from softmode.objects.pose import seat_of, stable_rotation
 from softmode.objects.shapes.presets import find_preset
 from softmode.objects.shapes.primitives import scaled, turned
 from softmode.objects.soft_object import SoftObject
-from softmode.objects.source import ObjectSource
+from softmode.objects.source import ObjectSource, pose_of
 from softmode.splats.splats import Splats
 from softmode.stages import stage
 
@@ -194,7 +194,7 @@ def dressed(body: ReducedBody, config: ObjectConfig, source: ObjectSource, mater
         told["material"] = json.dumps(find_preset(config.preset).properties)
     factor, field = float(np.cbrt(np.linalg.det(turn))), source.radiance
     if source.field_pose is not None:
-        laid = np.block([[turn, -body.offset[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]]) @ source.field_pose
+        laid = pose_of(turn, -body.offset) @ source.field_pose
         told["field_pose"] = json.dumps(laid.tolist())
     return SoftObject(
         body=replace(body, provenance={**body.provenance, **told}),

@@ -89,6 +89,11 @@ def object_source(config: ObjectConfig) -> ObjectSource:
     return _READERS[config.kind](config, getattr(config, config.kind, config.extents))
 
 
+def pose_of(linear: np.ndarray, move: np.ndarray) -> np.ndarray:
+    """Return the matrix (4, 4) of a linear map (3, 3) and a move (3,)."""
+    return np.block([[linear, move[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
+
+
 def upright_field(config: ObjectConfig, given: str | Path | RadianceGrid) -> tuple[RadianceGrid, np.ndarray]:
     """Return a field upright, cropped, standing on z = 0 around the origin, at its size, and what took it there."""
     grid = given if isinstance(given, RadianceGrid) else read_radiance(given)
@@ -99,7 +104,7 @@ def upright_field(config: ObjectConfig, given: str | Path | RadianceGrid) -> tup
     extent = float(np.ptp(grid.bounds, axis=0).max())
     scale = config.size / extent if config.size is not None else grid.metres or SIZE / extent
     move = -scale * seat_of(grid.bounds)
-    pose = np.block([[scale * up_rotation(up), move[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
+    pose = pose_of(scale * up_rotation(up), move)
     return grid.transformed(translation=move, scale=scale), pose
 
 
@@ -160,9 +165,10 @@ def _field_source(config: ObjectConfig, given: str | Path | RadianceGrid) -> Obj
     (grid, pose), splat_count = upright_field(config, given), config.splat_count or SPLATS
     key = ("radiance", *(getattr(grid, name) for name in ("density", "sh", "origin", "axes")))
     baked = baked_splats((*key, splat_count), grid, splat_count)
-    box = grid.bounds + np.array([[-1.0], [1.0]]) * grid.spacing
     options = {} if config.resolution is None else {"resolution": config.resolution}
-    solid = partial(quadrature_from_density, grid.densities, box, surface_count=config.surface_count, **options)
+    solid = partial(
+        quadrature_from_density, grid.densities, grid.surroundings, surface_count=config.surface_count, **options
+    )
     fitted = config.size if config.size is not None or grid.metres else SIZE
     return ObjectSource(baked, solid, grid.name, ("fog", *key, config.resolution), baked.count, fitted, grid, pose)
 

@@ -227,6 +227,11 @@ class RadianceGrid:
         places = self.origin + corners @ self.axes.T
         return np.stack([places.min(axis=0), places.max(axis=0)])
 
+    @property
+    def surroundings(self) -> Array:
+        """Corners of a box a step wider than `bounds` on every side [m], shape (2, 3)."""
+        return self.bounds + np.array([[-1.0], [1.0]]) * self.spacing
+
     def _index(self, points: ArrayLike) -> Array:
         """Return where points (N, 3) [m] lie among the nodes, shape (3, N)."""
         found: Any = np.linalg.solve(self.axes, (np.asarray(points, dtype=np.float64) - self.origin).T)

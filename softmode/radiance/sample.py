@@ -82,4 +82,4 @@ def _seen(field: Field, box: Array, name: str) -> Array:
         raise AssetError(f"{error.message}, sampled at {COARSE} nodes an edge in {box.tolist()}", hint=hint) from error
     if not (grid.density * grid.spacing > VISIBLE).any():
         raise AssetError(f"{name}: nothing can be seen in {box.tolist()}", hint="check the unit of its density")
-    return np.clip(grid.bounds + np.array([[-1.0], [1.0]]) * grid.spacing, *box)
+    return np.clip(grid.surroundings, *box)

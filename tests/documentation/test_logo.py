@@ -2,28 +2,18 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
 import xml.etree.ElementTree
-from types import ModuleType
 
 import numpy as np
 
 from tests.documentation.pages import ROOT
+from tests.modules import load
 
 IMAGES = ROOT / "docs" / "images"
 
 
-def load() -> ModuleType:
-    """Return the script as a module."""
-    spec = importlib.util.spec_from_file_location("logo", ROOT / "docs" / "logo.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-LOGO = load()
+LOGO = load(ROOT / "docs" / "logo.py")
 
 
 def test_the_gradient_is_that_of_the_motion() -> None:

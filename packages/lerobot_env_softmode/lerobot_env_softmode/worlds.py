@@ -51,12 +51,11 @@ class SoftmodeWorlds(gym.vector.VectorWrapper):
         from softmode.envs.catalogue import purpose
 
         self._base: Any = env.unwrapped
-        base = self._base
         assert env.spec is not None
         self.camera, self.task, self.task_description = camera, env.spec.id, purpose(env.spec.id)
-        self._max_episode_steps = base.max_episode_steps
-        self._state, self._agent_size = base.obs_type == "state", base.task.layout.agent_size
-        self.single_observation_space = self._space(base)
+        self._max_episode_steps = self._base.max_episode_steps
+        self._state, self._agent_size = self._base.obs_type == "state", self._base.task.layout.agent_size
+        self.single_observation_space = self._space(self._base)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self._ended = np.ones(self.num_envs, bool)
         self._ever = np.zeros(self.num_envs, bool)

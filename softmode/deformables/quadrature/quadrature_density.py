@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Literal, get_args
@@ -191,6 +192,7 @@ def _solid(occupancy: Array, fill_voids: bool) -> tuple[Array, float, dict[str, 
     """Return the occupancy of the largest part, the level of its surface, and what was left out and filled."""
     full = float(np.quantile(occupancy[occupancy > FAINT], 0.95))
 
+    @functools.cache
     def found(share: float) -> tuple[NDArray[np.bool_], NDArray[np.bool_], float]:
         """Return the largest part above a share of the full occupancy, what it encloses too, and its share of all."""
         parts: Any = ndimage.label(occupancy > share * full)

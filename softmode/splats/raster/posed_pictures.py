@@ -95,8 +95,7 @@ class PosedPicture:
     def rays(self) -> Array:
         """Return the unit directions of the pixels in the frame of the folder, lens off, shape (height, width, 3)."""
         c = self.camera
-        u, v = np.meshgrid(np.arange(c.width) + 0.5, np.arange(c.height) + 0.5)
-        flat = self.lens.undistorted(np.stack([(u - c.cx) / c.fx, (v - c.cy) / c.fy], axis=-1))
+        flat = self.lens.undistorted(_pixel_places(c))
         ways = np.concatenate([flat, np.ones((*flat.shape[:2], 1))], axis=-1) @ c.world_to_camera[:3, :3]
         return ways / np.linalg.norm(ways, axis=-1, keepdims=True)
 
@@ -111,10 +110,15 @@ class PosedPicture:
         return _resampled(self.camera, self.pixels(), self.lens.distorted)
 
 
+def _pixel_places(camera: PinholeCamera) -> NDArray[Any]:
+    """Return x = X / Z and y = Y / Z of a pinhole's pixels, shape (height, width, 2)."""
+    u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    return np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy], axis=-1)
+
+
 def _resampled(camera: PinholeCamera, picture: NDArray[Any], lens: Any) -> NDArray[np.float32]:
     """Return a picture (height, width, C) whose pixels are looked up where a map of x and y says."""
-    u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    at = lens(np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy], axis=-1))
+    at = lens(_pixel_places(camera))
     place = np.stack([at[..., 1] * camera.fy + camera.cy - 0.5, at[..., 0] * camera.fx + camera.cx - 0.5])
     parts = [ndimage.map_coordinates(part, place, order=1, mode="nearest") for part in np.moveaxis(picture, -1, 0)]
     return np.stack(parts, axis=-1).astype(np.float32)
