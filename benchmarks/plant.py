@@ -23,7 +23,7 @@ import warp as wp
 from benchmarks.clock import Clock
 from benchmarks.record import add_record_option, record
 from benchmarks.step import product_rate, report_torch, stages
-from examples.swaying_plant import BUILD, RATE, STEPS, blow, make_plant, make_scene
+from examples.swaying_plant import RATE, STEPS, blow, make_plant, make_scene
 from softmode.deformables import BuildOptions
 from softmode.deformables.reduction.sources import unpack_sources
 
@@ -46,7 +46,7 @@ def main() -> None:
     if given.ranks:
         print_ranks()
         return
-    build = BUILD
+    build = None
     if given.all:
         build = BuildOptions(handles="local", local_count=78, cubature_count=4800, rank_tolerance=given.rank_tolerance)
     start = time.process_time()

@@ -8,70 +8,31 @@ Run: ``python examples/excavator.py [--short]``; writes ``out/excavator.mp4`` an
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import trimesh
 import warp as wp
 
-from softmode.deformables import BuildOptions, Material
-from softmode.objects import Placed, SoftObject, StifferColor, load
+from softmode.deformables import BuildOptions
+from softmode.objects import EXCAVATOR_BUCKET, EXCAVATOR_HINGES, Placed, SoftObject, load_model
 from softmode.scenes import SplatScene
-from softmode.splats import ColoredMesh, PinholeCamera
+from softmode.splats import PinholeCamera
 from softmode.viz import Film
 
-RATE, STEPS, PULL, LET_GO, SLACK = 30, 4, 2.5, 60, 0.008
-"""Frames per second, steps of a frame, force on a bucket [N], frame when it ends; half a hinge [m]."""
-RUBBER = Material(youngs_modulus=4.0e6, poissons_ratio=0.4, density=600.0, viscosity=0.004, mass_damping=4.0)
-YELLOW, DARK, GLASS, BLACK = ((0.94, 0.70, 0.10), (0.28, 0.28, 0.30), (0.45, 0.68, 0.80), (0.05, 0.05, 0.06))
-SOFT = StifferColor(color=BLACK, factor=0.02)
-ROOT, ELBOW, WRIST, TIP = np.array([[0.045, 0, 0.085], [0.115, 0, 0.165], [0.185, 0, 0.105], [0.19, 0, 0.06]])
-"""Places of the hinges and of the bucket [m]."""
-BOXES = (  # edges, places [m] and colours
-    ((0.085, 0.10, 0.025), (0.0, 0.0, 0.055), YELLOW),
-    ((0.03, 0.09, 0.045), (-0.04, 0.0, 0.08), YELLOW),
-    ((0.035, 0.03, 0.04), (0.03, -0.01, 0.07), YELLOW),
-    ((0.045, 0.04, 0.05), (0.005, 0.03, 0.088), GLASS),
-    ((0.06, 0.06, 0.02), (0.0, 0.0, 0.035), DARK),
-)
+RATE, STEPS, PULL, LET_GO = 30, 4, 2.5, 60
+"""Frames per second, steps of a frame, force on a bucket [N], frame when it ends."""
+ROOT, ELBOW, WRIST = EXCAVATOR_HINGES
 BEAMS = ((ROOT, ELBOW, 0.035), (ELBOW, WRIST, 0.03))
 HANDLES = [(a + t * (b - a), radius) for a, b, radius in BEAMS for t in (0.25, 0.75)]
-KERNELS = [*HANDLES, (TIP, 0.03), *((hinge, 0.016) for hinge in (ROOT, ELBOW, WRIST))]
+KERNELS = [*HANDLES, (EXCAVATOR_BUCKET, 0.03), *((hinge, 0.016) for hinge in EXCAVATOR_HINGES)]
 """Places and radii of the handles that the user gives [m]."""
 BUILD = {"handles": "local", "local_count": 8, "function_count": 48, "cubature_count": 480}
 
 
-def make_mesh() -> Any:
-    """Return the toy: tracks, platform, cab, two beams on hinges, a bucket."""
-    parts, turned = [], trimesh.transformations.rotation_matrix
-
-    def add(mesh: Any, at: np.ndarray | tuple, color: tuple, angle: float = 0.0, axis: int = 1) -> None:
-        mesh.apply_transform(turned(angle, np.eye(3)[axis])).apply_translation(at)
-        mesh.visual.vertex_colors = np.tile([*color, 1.0], (len(mesh.vertices), 1))
-        parts.append(mesh)
-
-    for size, at, color in BOXES:
-        add(trimesh.creation.box(size), at, color)
-    for x, y in ((-0.055, -0.04), (-0.055, 0.04), (0.055, -0.04), (0.055, 0.04)):
-        add(trimesh.creation.box((0.055, 0.028, 0.034)), (0.5 * x, y, 0.02), DARK)
-        add(trimesh.creation.cylinder(0.017, 0.028, sections=24), (x, y, 0.02), DARK, np.pi / 2, 0)
-    for a, b, wide, ends in ((ROOT, ELBOW, 0.024, (1.0, 0.4)), (ELBOW, WRIST, 0.022, (0.4, 1.0))):
-        step, angle = SLACK * (b - a) / np.linalg.norm(b - a), np.arctan2(a[2] - b[2], b[0] - a[0])
-        hinges = (a - ends[0] * step, a + 1.4 * step, 0.02, BLACK), (b - 1.4 * step, b + ends[1] * step, 0.019, BLACK)
-        for low, high, edge, color in ((a + step, b - step, wide, YELLOW), *hinges):
-            add(trimesh.creation.box((np.linalg.norm(high - low), edge, edge)), 0.5 * (low + high), color, angle)
-    sides = ((0.185, 0.11), (0.20, 0.095), (0.205, 0.05), (0.165, 0.06))
-    add(trimesh.convex.convex_hull([(x, y, z) for y in (-0.03, 0.03) for x, z in sides]), (0.0, 0.0, 0.0), DARK)
-    return trimesh.util.concatenate(parts)
-
-
-def make_toy(mesh: Any, count: int, placed: bool) -> tuple[SoftObject, np.ndarray]:
+def make_toy(count: int, placed: bool) -> tuple[SoftObject, np.ndarray]:
     """Return the toy, with handles that the user gives or without, and the place of its bucket in its frame [m]."""
-    foot = np.array([*mesh.bounds.mean(axis=0)[:2], mesh.bounds[0, 2]])
-    build = BuildOptions(add_kernels=[(x - foot, r) for x, r in KERNELS] if placed else (), **BUILD)
-    how = {"build": build, "size": float(mesh.extents.max()), "clamped_height": 0.008, "stiffness_colors": (SOFT,)}
-    toy = load(ColoredMesh.from_trimesh(mesh, name="toy"), pose="captured", splat_count=count, material=RUBBER, **how)
-    return toy, TIP - foot - toy.body.offset
+    build = BuildOptions(add_kernels=KERNELS if placed else (), **BUILD)
+    toy = load_model("excavator", build=build, splat_count=count)
+    return toy, EXCAVATOR_BUCKET - toy.body.offset
 
 
 def make_scene(toys: list[SoftObject], edge: int) -> SplatScene:
@@ -96,9 +57,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--short", action="store_true")
     short = parser.parse_args(arguments).short
     wp.config.log_level = wp.LOG_WARNING
-    toys, tips = zip(
-        *(make_toy(make_mesh(), 4000 if short else 16000, placed) for placed in (False, True)), strict=True
-    )
+    toys, tips = zip(*(make_toy(4000 if short else 16000, placed) for placed in (False, True)), strict=True)
     scene, energy, moved = make_scene(list(toys), 96 if short else 280), [], []
     near = [np.linalg.norm(toy.body.surface.points - at, axis=1) < 0.025 for toy, at in zip(toys, tips, strict=True)]
     rest = [scene.surface(k)[some].mean(axis=0) for k, some in enumerate(near)]

@@ -10,56 +10,27 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-import trimesh
 import warp as wp
 
-from softmode.deformables import BuildOptions, Material, SoftEnergies
-from softmode.objects import Placed, SoftObject, load
+from softmode.deformables import BuildOptions, SoftEnergies
+from softmode.objects import Placed, SoftObject, load_model
 from softmode.scenes import Fixture, SplatScene
-from softmode.splats import ColoredMesh, PinholeCamera
+from softmode.splats import PinholeCamera
 from softmode.viz import Film
 
-HEIGHT, FOOT, RATE, DRAG, STEPS = 0.36, 0.03, 30, 0.6, 2
-"""Height of the stem, of what is in the earth [m]; frames per second; half of the air's density; steps of a frame."""
-BUILD = BuildOptions(handles="local", local_count=78, function_count=80, cubature_count=560)
-WOOD = Material(youngs_modulus=1.2e8, poissons_ratio=0.3, density=500.0, viscosity=0.004, mass_damping=0.3)
-BARK, STALK, DARK, LIGHT = np.array([[93, 64, 38], [104, 122, 48], [38, 112, 36], [120, 178, 62]])
+FOOT, RATE, DRAG, STEPS = 0.03, 30, 0.6, 2
+"""What is in the earth [m]; frames per second; half of the air's density; steps of a frame."""
 CALM, PULL, PULLED = 75, (100, 130), np.array([0.04, -0.05, -0.04])
 """Frame when the wind is over, those when the hand takes and lets go, and how far it pulls [m]."""
-T = 0.5 * (1.0 + (BALL := trimesh.creation.icosphere(subdivisions=3)).vertices[:, 0])
 
 
-def part(curve: np.ndarray, wide: float, thick: float, blunt: float, tints: np.ndarray) -> trimesh.Trimesh:
-    """Return a ball drawn out along a curve, whose points at T are given: pointed as a leaf, or blunt as a branch."""
-    values, first, back = np.unique(T.round(6), return_index=True, return_inverse=True)
-    way = np.gradient(curve[first], values, axis=0)[back]
-    side = np.cross((1.0, 0.0, 0.0) if np.ptp(curve[:, 2]) > 0.2 else (0.0, 0.0, 1.0), way)
-    top = np.cross(way, side)
-    y, z = BALL.vertices.T[1:] * np.maximum(4.0 * T * (1.0 - T), 1e-9) ** -blunt
-    across = wide * y / np.linalg.norm(side, axis=1) * side.T + thick * z / np.linalg.norm(top, axis=1) * top.T
-    colors = tints[0] + np.outer(T, tints[1] - tints[0])
-    return trimesh.Trimesh(curve + across.T, BALL.faces, vertex_colors=colors.astype(np.uint8), process=False)
-
-
-def make_plant(build: BuildOptions, splat_count: int) -> tuple[SoftObject, np.ndarray]:
+def make_plant(build: BuildOptions | None, splat_count: int) -> tuple[SoftObject, np.ndarray]:
     """Return the plant, held by its foot, and in its frame the foot and the tip of the top leaf [m], (2, 3)."""
-
-    def arch(root: np.ndarray, long: float, turn: float, rise: float, fall: float) -> np.ndarray:
-        return root + long * np.stack([np.cos(turn) * T, np.sin(turn) * T, rise * T - fall * T**2], axis=1)
-
-    stem = np.stack([0.01 * np.sin(3.0 * T), 0.01 * np.cos(2.4 * T) - 0.01, HEIGHT * T], axis=1)
-    parts = [part(stem, 0.0058, 0.0058, 0.45, np.array([BARK, STALK]))]
-    for k in range(9):
-        branch = arch(stem[np.abs(T - 0.3 - 0.08 * k).argmin()], 0.105 - 0.006 * k, 2.4 * k, 0.8, 0.3)
-        parts.append(part(branch, 0.004, 0.004, 0.45, np.array([STALK, DARK])))
-        for at, aside in ((0.6, 1.3), (0.96, -0.3)):
-            leaf = arch(branch[np.abs(T - at).argmin()], 0.09 - 0.004 * k, 2.4 * k + aside, 0.3, 0.75)
-            parts.append(part(leaf, 0.022 - 0.001 * k, 0.0026, 0.0, (0.8 + 0.04 * k) * np.array([DARK, LIGHT])))
-    mesh = trimesh.util.concatenate(parts)
-    how = {"material": WOOD, "build": build, "size": float(mesh.extents.max()), "clamped_height": FOOT}
-    plant = load(ColoredMesh.from_trimesh(mesh, name="plant"), pose="captured", splat_count=splat_count, **how)
-    places = np.array([np.zeros(3), leaf[np.abs(T - 0.85).argmin()]])
-    return plant, places - [*mesh.bounds.mean(axis=0)[:2], mesh.bounds[0, 2]] - plant.body.offset
+    plant = load_model("plant", build=build, splat_count=splat_count)
+    points = plant.body.surface.points
+    low = points[:, 2].min()
+    foot = np.array([*points[points[:, 2] < low + FOOT, :2].mean(axis=0), low])
+    return plant, np.array([foot, points[points[:, 2].argmax()]])
 
 
 def make_scene(plant: SoftObject, foot: np.ndarray, edge: int) -> SplatScene:
@@ -94,7 +65,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--short", action="store_true", help="small pictures")
     short = parser.parse_args(arguments).short
     wp.config.log_level = wp.LOG_WARNING
-    plant, places = make_plant(BUILD, 4000 if short else 14000)
+    plant, places = make_plant(None, 4000 if short else 14000)
     scene = make_scene(plant, places[0], 128 if short else 480)
     (hand,), energies, energy, track = scene.grips, SoftEnergies(scene.solver), [], []
     with Film(Path("out/swaying_plant.mp4")) as film:

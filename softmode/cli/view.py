@@ -36,8 +36,9 @@ class View:
     """
 
     target: tuple[str, ...]
-    """An environment's id; the file of a splat, a mesh, a radiance field, a saved body (.npz) or an OpenUSD stage; a
-    preset's name; the run of `softmode morph` (.npz), which is played back; the built-in plush if omitted."""
+    """An environment's id; the file of a splat, a mesh, a radiance field, a saved body (.npz) or an OpenUSD stage; the
+    name of a preset, or of a model that stands in its foot (plant, excavator, jelly); the run of `softmode morph`
+    (.npz), which is played back; the built-in plush if omitted."""
     scene: Literal["hang", "drop"] = "hang"
     """An object hangs, held by one end, or drops on a table."""
     hold: Literal["top", "base"] = "top"
@@ -196,8 +197,10 @@ def _session(options: View, show_progress: Callable[[str, float], None] | None =
     from softmode.envs.catalogue import env_class, registered_id
     from softmode.objects.captures import CAPTURES
     from softmode.objects.config import ObjectConfig
+    from softmode.objects.models import MODELS
     from softmode.objects.shapes.presets import PRESETS
     from softmode.robots.table_robot import TableRobot
+    from softmode.view.live_types import LiveOptions
     from softmode.view.session import LiveSession
 
     options.toy.check()
@@ -206,7 +209,7 @@ def _session(options: View, show_progress: Callable[[str, float], None] | None =
         raise ConfigError(f"{len(options.target)} things to show: {', '.join(options.target)}", hint="name one")
     device, target = warp_device(options.device), next(iter(options.target), None)
     with BuildBar(show_progress) as progress:
-        missing = target is not None and target not in (*PRESETS, *CAPTURES) and not Path(target).exists()
+        missing = target is not None and target not in (*PRESETS, *CAPTURES, *MODELS) and not Path(target).exists()
         if target is not None and missing and (target.startswith("softmode/") or ":" in target or target in registry):
             registered_id(target)
             _refuse(options, ("scene", "hold"), "an environment")
@@ -227,7 +230,7 @@ def _session(options: View, show_progress: Callable[[str, float], None] | None =
         if missing:
             raise AssetError(
                 f"{target} is neither a file nor an environment",
-                hint=f"give a splat, mesh or .npz file, or one of {', '.join([*ENVIRONMENTS, *PRESETS])}",
+                hint=f"give a splat, mesh or .npz file, or one of {', '.join([*ENVIRONMENTS, *PRESETS, *MODELS])}",
             )
         _refuse(options, ("policy", "seed"), "an object")
         if options.arm != RobotOptions():
@@ -238,8 +241,11 @@ def _session(options: View, show_progress: Callable[[str, float], None] | None =
                 raise ConfigError(f"{target} and {options.toy.file} are two objects", hint="name one")
             file = options.toy.object if target is None else Path(target)
             source = dataclasses.replace(options.toy, object=file).object_of(ObjectConfig())
+        if target in MODELS:
+            _refuse(options, ("scene", "hold"), "a model")
+        live = LiveOptions(substep=MODELS[target]) if target in MODELS else None
         session = LiveSession.from_object(
-            source, scene=options.scene, hold=options.hold, device=device, progress=progress
+            source, scene=options.scene, hold=options.hold, options=live, device=device, progress=progress
         )
         session.set_parameters(**options.toy.material)
         if source is not None:

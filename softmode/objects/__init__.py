@@ -19,6 +19,10 @@ if TYPE_CHECKING:
     from softmode.objects.mesh_fit import FitOptions as FitOptions
     from softmode.objects.mesh_fit import MeshFit as MeshFit
     from softmode.objects.mesh_fit import splats_from_mesh as splats_from_mesh
+    from softmode.objects.models import EXCAVATOR_BUCKET as EXCAVATOR_BUCKET
+    from softmode.objects.models import EXCAVATOR_HINGES as EXCAVATOR_HINGES
+    from softmode.objects.models import MODELS as MODELS
+    from softmode.objects.models import load_model as load_model
     from softmode.objects.object_file import surface_cover as surface_cover
     from softmode.objects.object_file import write_object as write_object
     from softmode.objects.object_set import ObjectSet as ObjectSet

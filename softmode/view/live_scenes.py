@@ -78,7 +78,8 @@ class ObjectScene:
         for name, value, known in (("scene", scene, SceneName), ("hold", hold, HoldName)):
             require_choice(name, value, get_args(known))
         thing, self.source, self._pin_points = found.object, found.object.config, options.pin_points
-        self._hold: HoldName | None = hold if scene == "hang" else None
+        stands = self.source is not None and self.source.clamped_height > 0.0  # its functions hold it by its foot
+        self._hold: HoldName | None = hold if scene == "hang" and not stands else None
         self.marker: Splats | None = None
         self.viewpoints: Sequence[PinholeCamera] = ()
         self.terms: dict[str, float] = {}

@@ -12,6 +12,7 @@ from softmode.errors import ConfigError
 from softmode.foreign import tokens
 from softmode.objects.config import ObjectConfig
 from softmode.objects.loader import Progress, load, object_config
+from softmode.objects.models import MODELS, load_model
 from softmode.objects.object_file import surface_cover
 from softmode.objects.placed import Placed
 from softmode.objects.soft_object import SoftObject
@@ -25,8 +26,8 @@ def load_source(
     """Return the object that a person names, at the origin and the scale that its stage gives it.
 
     Args:
-        source: A configuration, an object, a file, or None for the plush. Of an OpenUSD stage with deformable bodies
-            the first body is taken, of one without its splats.
+        source: A configuration, an object, a file, the name of a model, or None for the plush. Of an OpenUSD stage with
+            deformable bodies the first body is taken, of one without its splats.
         size: Longest edge [m]; None for the source's own.
         progress: Reports the build.
 
@@ -37,6 +38,9 @@ def load_source(
     if isinstance(source, SoftObject):
         _refuse_size(size, f"the body {source.body.name!r}")
         return Placed(object=source)
+    if isinstance(source, str) and source in MODELS:
+        _refuse_size(size, f"the model {source!r}")
+        return Placed(object=load_model(source, progress=progress))
     if isinstance(source, str | Path) and Path(source).suffix.lower() in tokens.SUFFIXES:
         deformables = read_usd_scene(source).deformables
         if deformables:

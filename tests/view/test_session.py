@@ -722,6 +722,21 @@ def test_objects_come_from_files(tmp_path):
         LiveSession.from_object(tmp_path / "none.ply")
 
 
+def test_a_model_stands_in_its_foot():
+    """A cube of gel is held by its foot alone: it sags a little less than a column whose foot is free to widen."""
+    live = LiveSession.from_object("jelly", options=PATIENT)
+    rest = live.surface()
+    settle(live, 60)
+    moved = live.surface() - rest
+    low = rest[:, 2] < rest[:, 2].min() + 1e-6
+    assert np.abs(moved[low]).max() < 1e-9
+    # that column, of 90 mm, E = 2e4 Pa, 1,000 kg/m^3: rho g h^2 / 2 E is 2.0 mm
+    high = rest[:, 2] > rest[:, 2].max() - 1e-6
+    assert 0.75 < -moved[high, 2].mean() / (1000.0 * 9.81 * 0.09**2 / 4.0e4) < 1.0
+    with pytest.raises(ConfigError, match="size given for the model 'jelly'"):
+        LiveSession.from_object("jelly", size=0.2)
+
+
 def test_a_body_of_a_stage(tmp_path):
     """A mesh that a stage declares deformable comes with the stage's material and units, and has no other handles."""
     pytest.importorskip("pxr")
