@@ -6,7 +6,7 @@ n of what is touched, the rest normal N and F of the body a step's velocity ahea
 
     m = P_N F^T n                               slope of the gap over the cell
     x = |m| L,  L = sqrt(3 A / pi)              range of a strip with the variance of a disc of area A
-    t = x / (1 + (x/a)^4) r^2/(9 + r^2)         range by tilt, none of a steep cell; r: compliance of the dent over that
+    t = x / (1 + (x/a)^4) r^2/(7 + r^2)         range by tilt, none of a steep cell; r: compliance of the dent over that
                                                 of the penalty, a: ``steepest``
     b = A (H + H_other) / (2 pi)                range by the mean curvatures of both: exact for a sphere
     e = sqrt(e_0^2 + t^2 + b^2)                 e_0: ``contact_smoothing``
@@ -24,7 +24,7 @@ import warp as wp
 from softmode.deformables.model.declare import struct
 from softmode.deformables.model.deformation_kernels import displacement_gradient
 from softmode.deformables.model.lane_kernels import vec8d
-from softmode.deformables.model.struct_kernels import SLOTS, Basis, Instances, Motion, interpolate
+from softmode.deformables.model.struct_kernels import SLOTS, Basis, Instances
 
 wp.set_module_options({"enable_backward": False})
 
@@ -40,10 +40,13 @@ FACING = wp.constant(wp.float64(0.2))
 LATE = wp.constant(wp.float64(0.15))
 """Share of e_0 by which a contact begins later than half its range outside: a face that rides in its onset then stands,
 from 1 to 10 % of strain, within 1 % of where it should."""
+STEEPEST = wp.constant(1.9)
+"""Range by tilt beyond which a cell counts as level again, in detection margins, thinner of a thin body: whoever is
+nearer than NEAR of it has been found. With 0.7, cells at the rim of a ball's patch are level: 3 to 5 % of its force."""
 NEAR = wp.constant(wp.float64(0.5))
 """Share of that bound, as a gap, beyond which a cell is level and nothing around it counts, as it cannot touch but by
 an impact: what flies past a shape must not feel that it might lean against it."""
-TURNING = wp.constant(wp.float64(9.0))
+TURNING = wp.constant(wp.float64(7.0))
 """Square of the dent, in penalties, with which a cell turns half of its way."""
 LEVEL = wp.constant(wp.float64(1.0e-3))
 """Range by tilt over e_0 below which a cell is level."""
@@ -98,7 +101,7 @@ def shape_of_cell(surface: Surface, instances: Instances, basis: Basis, i: int, 
     bend = wp.float64(s * s) * area * wp.float64(surface.curvature[row] / s + other) / (wp.float64(2.0) * PI)
     shape.bend = wp.max(bend, wp.float64(0.0))
     shape.least = wp.float64(instances.smoothing[i] / surface.slenderness[row])
-    shape.steepest = wp.float64(0.7 * instances.margin[i] / surface.slenderness[row])
+    shape.steepest = wp.float64(STEEPEST * instances.margin[i] / surface.slenderness[row])
     shape.fade = wp.float64(FADE * instances.size[i])
     return shape
 
@@ -158,20 +161,6 @@ def gradient_of(instances: Instances, basis: Basis, q: wp.array2d[vec8d], i: int
     """Return the deformation gradient F of an instance at a surface sample."""
     G = displacement_gradient(basis.row_gradient, q, i, row, instances.function_count[i])
     return wp.identity(n=3, dtype=wp.float64) + G
-
-
-@wp.func
-def ahead_of(
-    instances: Instances, basis: Basis, motion: Motion, start: wp.mat33d, n: wp.vec3d, i: int, row: int, dt: float
-):
-    """Return F of a sample and how far it moves along n [m] where it goes on for a step at its velocity.
-
-    How far a ball rolls in a step is what turns it: a centre of pressure of the start would lag by half a step.
-    """
-    count = instances.function_count[i]
-    h = wp.float64(dt)
-    rate = displacement_gradient(basis.row_gradient, motion.qd_start, i, row, count)
-    return start + h * rate, h * wp.dot(n, interpolate(basis.row, row, motion.qd_start, i, count))
 
 
 @wp.func

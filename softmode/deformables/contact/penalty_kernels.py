@@ -264,6 +264,24 @@ def dent_compliance(instances: Instances, i: int, relative: float, length: float
 
 
 @wp.func
+def beyond_penalty(stiffness: wp.float64, compliance: wp.float64):
+    """Return what a dent of a compliance [m/N] gives besides the penalty in series with it, which is part of it [m/N].
+
+    Smooth: w^2 / (w + 1/kappa), w - 1/kappa of a large dent.
+    """
+    ratio = stiffness * compliance
+    return compliance * ratio / (wp.float64(1.0) + ratio)
+
+
+@wp.func
+def beyond_exponent(ratio: wp.float64):
+    """Return d ln of that by ln of the dent, one more than by ln of the penalty; ``ratio``: that over the penalty's."""
+    two = wp.float64(2.0)
+    whole = ratio / two + wp.sqrt(ratio * ratio / (two * two) + ratio)  # of the dent
+    return two - whole / (wp.float64(1.0) + whole)
+
+
+@wp.func
 def dent_exponents(instances: Instances, i: int):
     """Return d ln(w / A) / d(ln E, nu, ln m, ln s) of a dent, w its compliance and A the sample's area."""
     one = wp.float64(1.0)
