@@ -16,7 +16,7 @@ from softmode.deformables.reduction.build_body import build_body
 from softmode.deformables.reduction.options import BuildOptions
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from tests import reference
-from tests.bodies import cube, held_bar, sheet, smooth_ball
+from tests.bodies import cube, default_ball, held_bar, sheet, smooth_ball
 from tests.scenes import GRAVITY, Scene
 
 RADIUS, RATIO = 0.05, 0.3
@@ -117,16 +117,13 @@ class Press:
         return float(constraints.force.numpy()[0, :count][below, 2].sum())
 
 
-@pytest.mark.parametrize("youngs_modulus", [1.0e5, 1.0e6])
-def test_hertz(youngs_modulus: float) -> None:
-    """A sphere between plates presses as Hertz's, made finite: within 15 % from 2 to 11 % of its radius.
-
-    32 functions alone press 1.6 to 3.6 times as hard there.
-    """
-    press = Press(smooth_ball(), RADIUS, youngs_modulus=youngs_modulus)
-    for share in (0.02, 0.04, 0.08, 0.11):
+@pytest.mark.parametrize("poissons_ratio", [0.3, pytest.param(0.49, marks=pytest.mark.rest)])
+def test_hertz(poissons_ratio: float) -> None:
+    """A sphere between plates, as users get it, presses as Hertz's, made finite: within 10 % from 1 to 8 % of R."""
+    press = Press(default_ball(poissons_ratio), RADIUS, poissons_ratio=poissons_ratio)
+    for share in (0.01, 0.02, 0.04, 0.08):
         depth = share * RADIUS
-        assert press.force(depth) == pytest.approx(hertz(depth, youngs_modulus), rel=0.15), share
+        assert press.force(depth) == pytest.approx(hertz(depth, 1.0e6, poissons_ratio), rel=0.1), share
 
 
 def settled(press: Press, force: float) -> float:
