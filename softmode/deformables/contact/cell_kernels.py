@@ -40,9 +40,6 @@ FACING = wp.constant(wp.float64(0.2))
 LATE = wp.constant(wp.float64(0.15))
 """Share of e_0 by which a contact begins later than half its range outside: a face that rides in its onset then stands,
 from 1 to 10 % of strain, within 1 % of where it should."""
-STEEPEST = wp.constant(1.9)
-"""Range by tilt beyond which a cell counts as level again, in detection margins, thinner of a thin body: whoever is
-nearer than NEAR of it has been found. With 0.7, cells at the rim of a ball's patch are level: 3 to 5 % of its force."""
 NEAR = wp.constant(wp.float64(0.5))
 """Share of that bound, as a gap, beyond which a cell is level and nothing around it counts, as it cannot touch but by
 an impact: what flies past a shape must not feel that it might lean against it."""
@@ -101,7 +98,7 @@ def shape_of_cell(surface: Surface, instances: Instances, basis: Basis, i: int, 
     bend = wp.float64(s * s) * area * wp.float64(surface.curvature[row] / s + other) / (wp.float64(2.0) * PI)
     shape.bend = wp.max(bend, wp.float64(0.0))
     shape.least = wp.float64(instances.smoothing[i] / surface.slenderness[row])
-    shape.steepest = wp.float64(STEEPEST * instances.margin[i] / surface.slenderness[row])
+    shape.steepest = wp.float64(0.7 * instances.margin[i] / surface.slenderness[row])
     shape.fade = wp.float64(FADE * instances.size[i])
     return shape
 
