@@ -18,7 +18,6 @@ The row of the contact is that of the sample plus T . grad: force and friction a
 of the sample is as much less as its neighbourhood touches the same thing: the functions carry what is wide.
 """
 
-import newton
 import warp as wp
 
 from softmode.deformables.model.declare import struct
@@ -28,9 +27,6 @@ from softmode.deformables.model.struct_kernels import SLOTS, Basis, Instances
 
 wp.set_module_options({"enable_backward": False})
 
-SPHERE, CAPSULE, CYLINDER = (
-    wp.constant(int(kind)) for kind in (newton.GeoType.SPHERE, newton.GeoType.CAPSULE, newton.GeoType.CYLINDER)
-)
 PI = wp.constant(wp.float64(3.14159265358979))
 FADE = wp.constant(1.0e-3)
 """Gap over the size of the body, besides its cell's range, over which a neighbour counts as touching less and less:
@@ -81,9 +77,7 @@ class CellShape:
     width: wp.float64  # L [m]
     bend: wp.float64  # b [m]
     least: wp.float64  # e_0 [m]
-    steepest: (
-        wp.float64
-    )  # range by tilt beyond which a cell counts as level again: most of the margin, thinner of a thin body [m]
+    steepest: wp.float64  # range by tilt beyond which a cell counts as level again: most of the margin [m]
     fade: wp.float64  # that of a level and flat cell [m]
 
 
@@ -193,16 +187,6 @@ def touched_share(
             if found[i, t, slot] == other:
                 carried += wp.float64(surface.weight[k]) * touching(neighbour_at(shape, fade, gap[i, t, slot]))
     return carried
-
-
-@wp.func
-def shape_curvature(kind: int, size: wp.vec3, across: float):
-    """Return the mean curvature [1/m] of a rigid shape; ``across``: cosine between its axis and the normal."""
-    if kind == SPHERE:
-        return 1.0 / size[0]
-    if kind == CAPSULE or kind == CYLINDER:
-        return 0.5 * (1.0 - across * across) / size[0]
-    return float(0.0)
 
 
 @wp.func

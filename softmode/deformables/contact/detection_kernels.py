@@ -16,7 +16,6 @@ from softmode.deformables.contact.cell_kernels import (
     cell_at,
     fade_of,
     gradient_of,
-    shape_curvature,
     shape_of_cell,
     touched_share,
     write_row,
@@ -32,9 +31,12 @@ from softmode.deformables.contact.penalty_kernels import (
     stiffness_per_area,
 )
 from softmode.deformables.contact.shape_query_kernels import (
+    CAPSULE,
+    CYLINDER,
     HEIGHTFIELD,
     PLANE,
     SMOOTH,
+    SPHERE,
     Heightfields,
     SurfaceQuery,
     query_heightfield,
@@ -401,9 +403,14 @@ def shape_area(shapes: Shapes, shape: int):
 @wp.func
 def curvature_of(shapes: Shapes, shape: int, normal: wp.vec3d):
     """Return the mean curvature [1/m] of a shape where its normal is ``normal``."""
-    _origin, rotation = shape_frame(shapes, shape)
-    axis = wp.quat_rotate(rotation, wp.vec3d(wp.float64(0.0), wp.float64(0.0), wp.float64(1.0)))
-    return shape_curvature(shapes.kind[shape], shapes.scale[shape], float(wp.dot(axis, normal)))
+    kind = shapes.kind[shape]
+    if kind == SPHERE:
+        return 1.0 / shapes.scale[shape][0]
+    if kind == CAPSULE or kind == CYLINDER:
+        _origin, rotation = shape_frame(shapes, shape)
+        across = float(wp.quat_rotate_inv(rotation, normal)[2])
+        return 0.5 * (1.0 - across * across) / shapes.scale[shape][0]
+    return float(0.0)
 
 
 @wp.func

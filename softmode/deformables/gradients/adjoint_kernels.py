@@ -57,9 +57,7 @@ class Linearised:
     constraint_hessian: wp.array2d[wp.mat33d]  # -d force / d displacement [N/m]; not symmetric where a contact slips
     constraint: wp.array2d[wp.vec3d]  # what is summed over the constraints next [N]
     memory: wp.array2d[wp.vec3d]  # what the next step feels of a contact's memory, over the stick stiffness
-    memory_start: wp.array2d[
-        wp.vec3d
-    ]  # the loss by the memory that a contact begins the step with, shape's frame [1/m]
+    memory_start: wp.array2d[wp.vec3d]  # the loss by the memory that a step begins with, shape's frame [1/m]
     contact_bar: wp.array2d[wp.vec3d]  # the loss by a contact's displacement [1/m], and
     normal_bar: wp.array2d[wp.vec3d]  # by its normal force, by ln of its dent's compliance and of its depth besides
     cell_gradient: wp.array2d[wp.mat33d]  # the loss by the gradient of a cell ahead, and
