@@ -122,7 +122,6 @@ def accumulate_cells(
         return
     zero = wp.float64(0.0)
     half = wp.float64(0.5)
-    count = instances.function_count[i]
     row = constraints.partner_row[i, e]
     shape = constraints.shape[i, e]
     n = constraints.normal[i, e]
@@ -151,7 +150,7 @@ def accumulate_cells(
     centre_bar = wp.vec3d()
     if constraints.row[i, e] != row:
         moved = gradient_of(instances, basis, q, i, row) - start
-        pulled = displacement_gradient(basis.row_gradient, costate, i, row, count)
+        pulled = displacement_gradient(basis.row_gradient, costate, i, row, instances.function_count[i])
         centre_bar = wp.transpose(pulled) * constraints.force[i, e] - wp.transpose(moved) * back
         centre_bar += along * (wp.transpose(ahead - start) * n)
         centre_bar += wp.transpose(start) * turned_back(shapes, shape, back, dt)
@@ -192,12 +191,12 @@ def accumulate_cells(
     # lengths grow with the scale, but not the radius of what is touched
     above = half * spared_bar * by_gap
     bend_bar = by_shape.bend + fade_bar * fade_shape.bend + above
-    area = wp.float64(instances.scale[i] * instances.scale[i] * basis.row_area[row])
     by_scale = depth_bar + fade_bar * fade_shape.fade * cell_shape.fade
     by_scale += (by_shape.steepest + fade_bar * fade_shape.steepest) * cell_shape.steepest
     by_scale += (by_shape.least - above) * cell_shape.least
     if cell_shape.bend > zero:
-        by_scale += bend_bar * (cell_shape.bend + area * wp.float64(other) / (wp.float64(2.0) * PI))
+        area = instances.scale[i] * instances.scale[i] * basis.row_area[row]
+        by_scale += bend_bar * (cell_shape.bend + wp.float64(area * other) / (wp.float64(2.0) * PI))
     firm = surface.relative_stiffness[row] * surface.slenderness[row]
     powers = stiffness_exponents(instances, i, BULK_FACTOR, firm, shape_area(shapes, shape), dt)
     powers = by_log * (powers + dent_exponents(instances, i))
