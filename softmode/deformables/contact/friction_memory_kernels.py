@@ -38,7 +38,9 @@ def remember_slip(
     points = mat23d()
     for slot in range(SLOTS):
         e = samples.constraint[i, s, slot]
-        if e < 0 or not (constraints.normal_force[i, e] > wp.float64(0.0)):
+        if e < 0:
+            continue
+        if not (constraints.normal_force[i, e] > wp.float64(0.0)):
             continue
         limit = constraints.friction[i, e] * constraints.normal_force[i, e]
         origin, rotation = shape_frame(shapes, constraints.shape[i, e])
