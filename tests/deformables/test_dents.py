@@ -23,7 +23,7 @@ RADIUS, RATIO = 0.05, 0.3
 SHAPE = 0.02
 """Half the height of what presses [m]."""
 MANY = SolverReducedOptions(contact_max=2048)
-FINITE = ((0.0, 0.01, 0.02, 0.04, 0.08, 0.11), (1.0, 1.033, 1.051, 1.078, 1.121, 1.150))
+FINITE = ((0.0, 0.01, 0.02, 0.04, 0.08, 0.11), (1.0, 1.030, 1.049, 1.076, 1.120, 1.149))
 """Force of a sphere between plates over Hertz's by depth over radius, nu 0.3: `benchmarks/hertz_elements.py`, the
 default material. 7,700 and 2,400 elements agree to 0.2 %; nu 0.45 has up to 1.2 % more, linear elasticity 2 to 7 %."""
 
@@ -119,11 +119,14 @@ class Press:
 
 @pytest.mark.parametrize("poissons_ratio", [0.3, pytest.param(0.49, marks=pytest.mark.rest)])
 def test_hertz(poissons_ratio: float) -> None:
-    """A sphere between plates, as users get it, presses as Hertz's, made finite: within 10 % from 1 to 8 % of R."""
+    """A sphere between plates, as users get it, presses as Hertz's, made finite: within 7 % from 2 to 8 % of R.
+
+    At 1 % its patch has five samples.
+    """
     press = Press(default_ball(poissons_ratio), RADIUS, poissons_ratio=poissons_ratio)
     for share in (0.01, 0.02, 0.04, 0.08):
-        depth = share * RADIUS
-        assert press.force(depth) == pytest.approx(hertz(depth, 1.0e6, poissons_ratio), rel=0.1), share
+        depth, error = share * RADIUS, 0.15 if share == 0.01 else 0.07
+        assert press.force(depth) == pytest.approx(hertz(depth, 1.0e6, poissons_ratio), rel=error), share
 
 
 def settled(press: Press, force: float) -> float:
