@@ -16,6 +16,7 @@ from scipy.sparse import linalg
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 PERMUTATION = np.zeros((3, 3, 3))
 for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
     PERMUTATION[_i, _j, _k], PERMUTATION[_i, _k, _j] = 1.0, -1.0
@@ -43,7 +44,7 @@ def graded(count: int, share: float) -> Array:
     return share * x**2 + (1.0 - share) * x
 
 
-def sphere(around: int, out: int) -> tuple[Array, Array, Array, Ints, Array, Array]:
+def sphere(around: int, out: int) -> tuple[Array, Array, Array, Ints, Mask, Array]:
     """Return matrices and weights of F, dofs, what is held, the surface and its areas, of half a sphere about Z."""
     angle, radius = np.meshgrid(0.5 * np.pi * graded(around, 0.85), 1.0 - graded(out, 0.85)[::-1], indexing="ij")
     x = np.stack([radius * np.sin(angle), radius * np.cos(angle)], -1).reshape(-1, 2)
@@ -66,7 +67,7 @@ def sphere(around: int, out: int) -> tuple[Array, Array, Array, Ints, Array, Arr
     return matrix, 2.0 * np.pi * r * weight, x, corners, held, np.stack([top, area])
 
 
-def wedge(across: int, along: int, deep: int) -> tuple[Array, Array, Array, Ints, Array, Array]:
+def wedge(across: int, along: int, deep: int) -> tuple[Array, Array, Array, Ints, Mask, Array]:
     """Return the same of a quarter of a cube of edge 1, finer where the edge of the wedge, along Y, presses."""
     lines = (0.5 * graded(across, 0.9), 0.5 * graded(along, 0.0), 1.0 - graded(deep, 0.9)[::-1])
     x = np.stack(np.meshgrid(*lines, indexing="ij"), -1).reshape(-1, 3)
@@ -117,7 +118,7 @@ def press(
     weight: Array,
     x: Array,
     corners: Ints,
-    held: Array,
+    held: Mask,
     surface: Array,
     depths: tuple[float, ...],
     ratio: float,
