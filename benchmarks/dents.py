@@ -12,9 +12,10 @@ import numpy as np
 import warp as wp
 
 from softmode.deformables.body.reduced_body import ReducedBody
-from softmode.deformables.quadrature.quadrature import quadrature_from_box, quadrature_from_sphere
+from softmode.deformables.quadrature.quadrature import quadrature_from_box
 from softmode.deformables.reduction.build_body import build_body
 from softmode.deformables.reduction.options import BuildOptions
+from tests.bodies import default_ball
 from tests.bodies import smooth_ball as ball
 from tests.deformables.test_dents import RADIUS, RATIO, Press, hertz
 
@@ -58,12 +59,6 @@ def main() -> None:
             press, depth = Press(body, 0.5 * edges[2], stiffness=stiffness), 0.02 * edges[2]
             whole = press.force(depth) * edges[2] / (1.0e6 * edges[0] * edges[1] * 2.0 * depth)
             print(f"{name}, {body.function_count} functions, {kind}:", *shown(row), "whole face", *shown([whole]))
-
-
-def default_ball(poissons_ratio: float) -> ReducedBody:
-    """Return a sphere with the functions that a body of a Poisson's ratio has by default."""
-    quadrature = quadrature_from_sphere(RADIUS, point_count=3000)
-    return build_body(quadrature, BuildOptions(poissons_ratio=poissons_ratio), name="ball")
 
 
 def rigid(body: ReducedBody, youngs_modulus: float) -> float:

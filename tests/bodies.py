@@ -142,6 +142,13 @@ def default_box() -> Recipe:
 
 
 @kept
+def default_ball(poissons_ratio: float = 0.3) -> Recipe:
+    """Return a ball of 5 cm radius as users get one, with functions for a Poisson's ratio."""
+    options = BuildOptions(poissons_ratio=poissons_ratio)
+    return Recipe(name="ball", shape=quadrature_from_sphere, of=(0.05,), points=3000, samples=800, options=options)
+
+
+@kept
 def small_box() -> Recipe:
     """Return the same box of few functions, points and samples."""
     options = freeform(4, 120, 96)

@@ -100,8 +100,11 @@ def still(body: ReducedBody, modulus: float) -> float:
 
     scene = Scene(populate, [body], gravity=DOWN, ground=0.8, dt=1.0 / 240.0)
     replay = scene.capture()
+    replay()
+    falling = scene.reduced.view.settled()[0]
     for _ in range(240):
         replay()
+    assert scene.reduced.view.settled()[0] < 1.0e-6 < 0.1 * falling
     return scene.kinetic_energy() / (scene.mass() * GRAVITY * 0.05)
 
 

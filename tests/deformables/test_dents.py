@@ -16,16 +16,16 @@ from softmode.deformables.reduction.build_body import build_body
 from softmode.deformables.reduction.options import BuildOptions
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from tests import reference
-from tests.bodies import cube, held_bar, sheet, smooth_ball
+from tests.bodies import cube, default_ball, held_bar, sheet, smooth_ball
 from tests.scenes import GRAVITY, Scene
 
 RADIUS, RATIO = 0.05, 0.3
 SHAPE = 0.02
 """Half the height of what presses [m]."""
 MANY = SolverReducedOptions(contact_max=2048)
-FINITE = ((0.0, 0.01, 0.02, 0.04, 0.08, 0.11), (1.0, 1.02, 1.10, 1.12, 1.18, 1.23))
-"""Force of a sphere between plates over Hertz's by depth over radius: 2,600 kernels, linear elasticity; the far field
-of each contact moves the centre."""
+FINITE = ((0.0, 0.01, 0.02, 0.04, 0.08, 0.11), (1.0, 1.030, 1.049, 1.076, 1.120, 1.149))
+"""Force of a sphere between plates over Hertz's by depth over radius, nu 0.3: `benchmarks/hertz_elements.py`, the
+default material. 7,700 and 2,400 elements agree to 0.2 %; nu 0.45 has up to 1.2 % more, linear elasticity 2 to 7 %."""
 
 
 def hertz(depth: float, youngs_modulus: float, poissons_ratio: float = RATIO) -> float:
@@ -117,16 +117,16 @@ class Press:
         return float(constraints.force.numpy()[0, :count][below, 2].sum())
 
 
-@pytest.mark.parametrize("youngs_modulus", [1.0e5, 1.0e6])
-def test_hertz(youngs_modulus: float) -> None:
-    """A sphere between plates presses as Hertz's, made finite: within 15 % from 2 to 11 % of its radius.
+@pytest.mark.parametrize("poissons_ratio", [0.3, pytest.param(0.49, marks=pytest.mark.rest)])
+def test_hertz(poissons_ratio: float) -> None:
+    """A sphere between plates, as users get it, presses as Hertz's, made finite: within 7 % from 2 to 8 % of R.
 
-    32 functions alone press 1.6 to 3.6 times as hard there.
+    At 1 % its patch has five samples.
     """
-    press = Press(smooth_ball(), RADIUS, youngs_modulus=youngs_modulus)
-    for share in (0.02, 0.04, 0.08, 0.11):
-        depth = share * RADIUS
-        assert press.force(depth) == pytest.approx(hertz(depth, youngs_modulus), rel=0.15), share
+    press = Press(default_ball(poissons_ratio), RADIUS, poissons_ratio=poissons_ratio)
+    for share in (0.01, 0.02, 0.04, 0.08):
+        depth, error = share * RADIUS, 0.15 if share == 0.01 else 0.07
+        assert press.force(depth) == pytest.approx(hertz(depth, 1.0e6, poissons_ratio), rel=error), share
 
 
 def settled(press: Press, force: float) -> float:

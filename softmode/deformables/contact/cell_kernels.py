@@ -6,7 +6,7 @@ n of what is touched, the rest normal N and F of the body a step's velocity ahea
 
     m = P_N F^T n                               slope of the gap over the cell
     x = |m| L,  L = sqrt(3 A / pi)              range of a strip with the variance of a disc of area A
-    t = x / (1 + (x/a)^4) r^2/(9 + r^2)         range by tilt, none of a steep cell; r: compliance of the dent over that
+    t = x / (1 + (x/a)^4) r^2/(7 + r^2)         range by tilt, none of a steep cell; r: compliance of the dent over that
                                                 of the penalty, a: ``steepest``
     b = A (H + H_other) / (2 pi)                range by the mean curvatures of both: exact for a sphere
     e = sqrt(e_0^2 + t^2 + b^2)                 e_0: ``contact_smoothing``
@@ -18,19 +18,15 @@ The row of the contact is that of the sample plus T . grad: force and friction a
 of the sample is as much less as its neighbourhood touches the same thing: the functions carry what is wide.
 """
 
-import newton
 import warp as wp
 
 from softmode.deformables.model.declare import struct
 from softmode.deformables.model.deformation_kernels import displacement_gradient
 from softmode.deformables.model.lane_kernels import vec8d
-from softmode.deformables.model.struct_kernels import SLOTS, Basis, Instances, Motion, interpolate
+from softmode.deformables.model.struct_kernels import SLOTS, Basis, Instances
 
 wp.set_module_options({"enable_backward": False})
 
-SPHERE, CAPSULE, CYLINDER = (
-    wp.constant(int(kind)) for kind in (newton.GeoType.SPHERE, newton.GeoType.CAPSULE, newton.GeoType.CYLINDER)
-)
 PI = wp.constant(wp.float64(3.14159265358979))
 FADE = wp.constant(1.0e-3)
 """Gap over the size of the body, besides its cell's range, over which a neighbour counts as touching less and less:
@@ -43,7 +39,7 @@ from 1 to 10 % of strain, within 1 % of where it should."""
 NEAR = wp.constant(wp.float64(0.5))
 """Share of that bound, as a gap, beyond which a cell is level and nothing around it counts, as it cannot touch but by
 an impact: what flies past a shape must not feel that it might lean against it."""
-TURNING = wp.constant(wp.float64(9.0))
+TURNING = wp.constant(wp.float64(7.0))
 """Square of the dent, in penalties, with which a cell turns half of its way."""
 LEVEL = wp.constant(wp.float64(1.0e-3))
 """Range by tilt over e_0 below which a cell is level."""
@@ -81,9 +77,7 @@ class CellShape:
     width: wp.float64  # L [m]
     bend: wp.float64  # b [m]
     least: wp.float64  # e_0 [m]
-    steepest: (
-        wp.float64
-    )  # range by tilt beyond which a cell counts as level again: most of the margin, thinner of a thin body [m]
+    steepest: wp.float64  # range by tilt beyond which a cell counts as level again: most of the margin [m]
     fade: wp.float64  # that of a level and flat cell [m]
 
 
@@ -161,20 +155,6 @@ def gradient_of(instances: Instances, basis: Basis, q: wp.array2d[vec8d], i: int
 
 
 @wp.func
-def ahead_of(
-    instances: Instances, basis: Basis, motion: Motion, start: wp.mat33d, n: wp.vec3d, i: int, row: int, dt: float
-):
-    """Return F of a sample and how far it moves along n [m] where it goes on for a step at its velocity.
-
-    How far a ball rolls in a step is what turns it: a centre of pressure of the start would lag by half a step.
-    """
-    count = instances.function_count[i]
-    h = wp.float64(dt)
-    rate = displacement_gradient(basis.row_gradient, motion.qd_start, i, row, count)
-    return start + h * rate, h * wp.dot(n, interpolate(basis.row, row, motion.qd_start, i, count))
-
-
-@wp.func
 def touching(x: wp.float64):
     """Return how much a neighbour counts as touching, from none at 0 to all at 1."""
     y = wp.min(wp.max(x, wp.float64(0.0)), wp.float64(1.0))
@@ -207,16 +187,6 @@ def touched_share(
             if found[i, t, slot] == other:
                 carried += wp.float64(surface.weight[k]) * touching(neighbour_at(shape, fade, gap[i, t, slot]))
     return carried
-
-
-@wp.func
-def shape_curvature(kind: int, size: wp.vec3, across: float):
-    """Return the mean curvature [1/m] of a rigid shape; ``across``: cosine between its axis and the normal."""
-    if kind == SPHERE:
-        return 1.0 / size[0]
-    if kind == CAPSULE or kind == CYLINDER:
-        return 0.5 * (1.0 - across * across) / size[0]
-    return float(0.0)
 
 
 @wp.func

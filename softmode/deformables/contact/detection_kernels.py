@@ -13,11 +13,9 @@ import warp as wp
 from softmode.deformables.contact.cell_kernels import (
     NEAR,
     Surface,
-    ahead_of,
     cell_at,
     fade_of,
     gradient_of,
-    shape_curvature,
     shape_of_cell,
     touched_share,
     write_row,
@@ -26,21 +24,26 @@ from softmode.deformables.contact.penalty_kernels import (
     BULK_FACTOR,
     HARDENING_DEPTH,
     SHEAR_FACTOR,
+    beyond_penalty,
     dent_compliance,
     dent_depth,
     shear_yield,
     stiffness_per_area,
 )
 from softmode.deformables.contact.shape_query_kernels import (
+    CAPSULE,
+    CYLINDER,
     HEIGHTFIELD,
     PLANE,
     SMOOTH,
+    SPHERE,
     Heightfields,
     SurfaceQuery,
     query_heightfield,
     query_shape,
 )
 from softmode.deformables.model.declare import struct
+from softmode.deformables.model.deformation_kernels import displacement_gradient
 from softmode.deformables.model.lane_kernels import barrier
 from softmode.deformables.model.status import (
     PARAMETER_BITS,
@@ -400,18 +403,42 @@ def shape_area(shapes: Shapes, shape: int):
 @wp.func
 def curvature_of(shapes: Shapes, shape: int, normal: wp.vec3d):
     """Return the mean curvature [1/m] of a shape where its normal is ``normal``."""
-    _origin, rotation = shape_frame(shapes, shape)
-    axis = wp.quat_rotate(rotation, wp.vec3d(wp.float64(0.0), wp.float64(0.0), wp.float64(1.0)))
-    return shape_curvature(shapes.kind[shape], shapes.scale[shape], float(wp.dot(axis, normal)))
+    kind = shapes.kind[shape]
+    if kind == SPHERE:
+        return 1.0 / shapes.scale[shape][0]
+    if kind == CAPSULE or kind == CYLINDER:
+        _origin, rotation = shape_frame(shapes, shape)
+        across = float(wp.quat_rotate_inv(rotation, normal)[2])
+        return 0.5 * (1.0 - across * across) / shapes.scale[shape][0]
+    return float(0.0)
 
 
 @wp.func
-def shape_drift(shapes: Shapes, shape: int, x: wp.vec3, dt: float):
-    """Return how far a point of a shape moves in a step at its velocity [m]."""
+def motion_of_cell(
+    instances: Instances,
+    basis: Basis,
+    motion: Motion,
+    shapes: Shapes,
+    samples: Samples,
+    i: int,
+    row: int,
+    shape: int,
+    n: wp.vec3d,
+    dt: float,
+):
+    """Return F of a sample, F a step at its velocity ahead, and how far its gap with a shape then grows [m].
+
+    How far a ball rolls in a step is what turns it: a centre of pressure of the start would lag by half a step.
+    """
+    count = instances.function_count[i]
+    start = gradient_of(instances, basis, motion.q_start, i, row)
+    rate = displacement_gradient(basis.row_gradient, motion.qd_start, i, row, count)
+    velocity = interpolate(basis.row, row, motion.qd_start, i, count)
     body = shapes.body[shape]
-    if body < 0:
-        return wp.vec3()
-    return dt * point_velocity(shapes.body_q[body], shapes.body_qd[body], shapes.body_com[body], x)
+    if body >= 0:
+        x = wp.vec3(samples.position[i, row - instances.row_start[i]])
+        velocity -= wp.vec3d(point_velocity(shapes.body_q[body], shapes.body_qd[body], shapes.body_com[body], x))
+    return start, start + wp.float64(dt) * rate, wp.float64(dt) * wp.dot(n, velocity)
 
 
 @wp.func
@@ -564,9 +591,7 @@ def gather_contacts(
         closing = wp.float64(0.0)
         spared = float(1.0)
         if gap <= NEAR * cell_shape.steepest:
-            start = gradient_of(instances, basis, motion.q_start, i, row)
-            ahead, closing = ahead_of(instances, basis, motion, start, normal, i, row, dt)
-            closing -= wp.dot(normal, wp.vec3d(shape_drift(shapes, shape, wp.vec3(samples.position[i, s]), dt)))
+            start, ahead, closing = motion_of_cell(instances, basis, motion, shapes, samples, i, row, shape, normal, dt)
             fade = fade_of(cell_shape, ahead, normal)
             touched = touched_share(surface, samples.shape, samples.gap, cell_shape, fade, i, row, shape)
             spared = float(wp.float64(1.0) - touched * touched)
@@ -583,6 +608,7 @@ def gather_contacts(
         share = float(1.0)
         if partner_mass > 0.0:  # what is light beside the body turns faster than its cells, which lag by a step
             share = partner_mass / (partner_mass + float(instances.mass[i]))
+        compliance = beyond_penalty(stiffness, compliance)
         ratio = stiffness * compliance * wp.float64(share * share)
         cell = cell_at(cell_shape, ahead, normal, gap, closing, ratio)
         turned = wp.dot(normal, (ahead - start) * cell.centre)

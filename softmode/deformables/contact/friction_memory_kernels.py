@@ -43,8 +43,7 @@ def remember_slip(
         if not (constraints.normal_force[i, e] > wp.float64(0.0)):
             continue
         limit = constraints.friction[i, e] * constraints.normal_force[i, e]
-        shape = constraints.shape[i, e]
-        origin, rotation = shape_frame(shapes, shape)
+        origin, rotation = shape_frame(shapes, constraints.shape[i, e])
         total = constraints.slip[i, e]
         slid = wp.length(total)
         most = elastic_slip(limit, constraints.stick[i, e], constraints.stick_deep[i, e], constraints.dent_depth[i, e])
@@ -61,7 +60,7 @@ def remember_slip(
             before = constraints.offset[i, e] - wp.dot(n, constraints.offset[i, e]) * n
             held = samples.position[i, s] - before + total - elastic
             point = wp.quat_rotate_inv(rotation, held - origin)
-        stuck[slot] = shape
+        stuck[slot] = constraints.shape[i, e]
         points[slot] = point
     particle = instances.particle_start[i] + s
     stick_shape_out[particle] = stuck

@@ -38,6 +38,7 @@ from softmode.deformables.contact.penalty_kernels import (
     BULK_FACTOR,
     HARDENING_DEPTH,
     SHEAR_FACTOR,
+    beyond_penalty,
     dent_compliance,
     dent_depth,
     elastic_slip,
@@ -552,12 +553,15 @@ def write_pairs(
     spared_j = float(wp.float64(1.0) - touched_share(surface, pairs.other, pairs.gap, theirs, fade, j, at, i))
     wi = wp.float64(spared_i * dent_compliance(instances, i, ri, surface.dent_length[own]) / half_area)
     wj = wp.float64(spared_j * dent_compliance(instances, j, rj, surface.dent_length[at]) / half_area)
-    compliance = wi + wj
+    compliance = beyond_penalty(stiffness, wi + wj)
     cell = cell_at(mine, F_own, n, pairs.gap[i, s, slot], wp.float64(0.0), stiffness * compliance)
     stick = stick_ratio * shear
     deep = stick
-    stick = stick / (wp.float64(1.0) + stick * (shear_yield(instances, i, wi) + shear_yield(instances, j, wj)))
-    pairs.share[i, s, slot] = float(wi / wp.max(compliance, wp.float64(1.0e-30)))
+    part = wi / wp.max(wi + wj, wp.float64(1.0e-30))
+    along = part * shear_yield(instances, i, compliance)
+    along += (wp.float64(1.0) - part) * shear_yield(instances, j, compliance)
+    stick = stick / (wp.float64(1.0) + stick * along)
+    pairs.share[i, s, slot] = float(part)
     thick = wp.max(instances.scale[i] * pairs.thickness[own], instances.scale[j] * pairs.thickness[at])
     depth = spared_i * dent_depth(instances, i, surface.dent_length[own], True)
     depth += spared_j * dent_depth(instances, j, surface.dent_length[at], True)

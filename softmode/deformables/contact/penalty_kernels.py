@@ -144,12 +144,7 @@ def stick_potential(y: wp.float64, limit: wp.float64, stiffness: wp.float64, dee
 
 @wp.func
 def slip_potential(
-    y: wp.float64,
-    limit: wp.float64,
-    stick: wp.float64,
-    deep: wp.float64,
-    depth: wp.float64,
-    stick_range: wp.float64,
+    y: wp.float64, limit: wp.float64, stick: wp.float64, deep: wp.float64, depth: wp.float64, stick_range: wp.float64
 ):
     """Return energy [J], force over slip and curvature along the slip [N/m] of friction, with memory or smoothed."""
     if stick > wp.float64(0.0):
@@ -204,10 +199,8 @@ def stiffness_exponents(instances: Instances, i: int, factor: float, relative: f
     none = wp.float64(0.0)
     one = wp.float64(1.0)
     two = wp.float64(2.0)
-    if instances.contact_stiffness[i] > 0.0:
-        return wp.vec4d(none, none, none, two)
     bulk, inertia = stiffness_sources(instances, i, factor, relative, 0.0, partner_area, dt)
-    if wp.max(bulk, inertia) <= STIFFNESS_FLOOR:
+    if instances.contact_stiffness[i] > 0.0 or wp.max(bulk, inertia) <= STIFFNESS_FLOOR:
         return wp.vec4d(none, none, none, two)
     if inertia > bulk:
         return wp.vec4d(none, none, one, wp.where(instances.area[i] < partner_area, none, two))
@@ -261,6 +254,24 @@ def dent_compliance(instances: Instances, i: int, relative: float, length: float
         return float(0.0)
     nu = instances.poissons_ratio[i]
     return instances.scale[i] * length * (1.0 - nu * nu) / (relative * instances.youngs_modulus[i])
+
+
+@wp.func
+def beyond_penalty(stiffness: wp.float64, compliance: wp.float64):
+    """Return what a dent of a compliance [m/N] gives besides the penalty in series with it, which is part of it [m/N].
+
+    Smooth: w^2 / (w + 1/kappa), w - 1/kappa of a large dent.
+    """
+    ratio = stiffness * compliance
+    return compliance * ratio / (wp.float64(1.0) + ratio)
+
+
+@wp.func
+def beyond_exponent(ratio: wp.float64):
+    """Return d ln of that by ln of the dent, one more than by ln of the penalty; ``ratio``: that over the penalty's."""
+    half = wp.float64(0.5) * ratio
+    one = wp.float64(1.0)
+    return one + one / (one + half + wp.sqrt(half * half + ratio))
 
 
 @wp.func

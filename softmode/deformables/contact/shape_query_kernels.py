@@ -12,18 +12,18 @@ wp.set_module_options({"enable_backward": False})
 
 PLANE = int(GeoType.PLANE)
 HEIGHTFIELD = int(GeoType.HFIELD)
-_SPHERE = int(GeoType.SPHERE)
-_CAPSULE = int(GeoType.CAPSULE)
+SPHERE = int(GeoType.SPHERE)
+CAPSULE = int(GeoType.CAPSULE)
 _ELLIPSOID = int(GeoType.ELLIPSOID)
-_CYLINDER = int(GeoType.CYLINDER)
+CYLINDER = int(GeoType.CYLINDER)
 _BOX = int(GeoType.BOX)
 _MESH = int(GeoType.MESH)
 _CONE = int(GeoType.CONE)
 _CONVEX_MESH = int(GeoType.CONVEX_MESH)
-SMOOTH = sum(1 << kind for kind in (PLANE, HEIGHTFIELD, _SPHERE, _CAPSULE, _ELLIPSOID))
+SMOOTH = sum(1 << kind for kind in (PLANE, HEIGHTFIELD, SPHERE, CAPSULE, _ELLIPSOID))
 """Bits of the kinds of shapes without edges."""
 
-SUPPORTED_SHAPES = (PLANE, HEIGHTFIELD, _SPHERE, _CAPSULE, _ELLIPSOID, _CYLINDER, _BOX, _MESH, _CONE, _CONVEX_MESH)
+SUPPORTED_SHAPES = (PLANE, HEIGHTFIELD, SPHERE, CAPSULE, _ELLIPSOID, CYLINDER, _BOX, _MESH, _CONE, _CONVEX_MESH)
 """Shape types a soft body can touch."""
 
 
@@ -362,11 +362,11 @@ def query_shape(shape_type: int, scale: wp.vec3, mesh: wp.uint64, x: wp.vec3, re
     out = surface(1.0e6, wp.vec3())
     if shape_type == PLANE:
         out = query_plane(x, scale)
-    elif shape_type == _SPHERE:
+    elif shape_type == SPHERE:
         out = query_segment(x, 0.0, scale[0])
-    elif shape_type == _CAPSULE:
+    elif shape_type == CAPSULE:
         out = query_segment(x, scale[1], scale[0])
-    elif shape_type == _CYLINDER:
+    elif shape_type == CYLINDER:
         out = query_cylinder(x, scale[0], scale[1])
     elif shape_type == _CONE:
         out = query_cone(x, scale[0], scale[1])

@@ -12,6 +12,7 @@ from softmode.deformables.contact.penalty_kernels import (
     ALONG,
     BULK_FACTOR,
     SHEAR_FACTOR,
+    beyond_exponent,
     contact_potential,
     dent_exponents,
     elastic_slip,
@@ -56,14 +57,13 @@ class Linearised:
     constraint_hessian: wp.array2d[wp.mat33d]  # -d force / d displacement [N/m]; not symmetric where a contact slips
     constraint: wp.array2d[wp.vec3d]  # what is summed over the constraints next [N]
     memory: wp.array2d[wp.vec3d]  # what the next step feels of a contact's memory, over the stick stiffness
-    memory_start: wp.array2d[
-        wp.vec3d
-    ]  # the loss by the memory that a contact begins the step with, shape's frame [1/m]
+    memory_start: wp.array2d[wp.vec3d]  # the loss by the memory that a step begins with, shape's frame [1/m]
     contact_bar: wp.array2d[wp.vec3d]  # the loss by a contact's displacement [1/m], and
     normal_bar: wp.array2d[wp.vec3d]  # by its normal force, by ln of its dent's compliance and of its depth besides
     cell_gradient: wp.array2d[wp.mat33d]  # the loss by the gradient of a cell ahead, and
     cell_place: wp.array2d[wp.vec3d]  # by the sample's place ahead [1/m]
     cell_spared: wp.array2d[wp.float64]  # by the share of the neighbourhood that does not touch
+    cell_fade: wp.array2d[wp.vec2d]  # gap at which a neighbour begins to count, and over which it comes to count [m]
     sample_place: wp.array2d[wp.vec3d]  # (instance_count, sample_max), the loss by its place at the start [1/m]
 
 
@@ -536,7 +536,8 @@ def accumulate_constraints(
     partner_area = shape_area(shapes, shape)
     firm = relative * surface.slenderness[sample]
     stiffness_powers = stiffness_exponents(instances, i, BULK_FACTOR, firm, partner_area, dt)
-    dent_powers = dent_exponents(instances, i)
+    steep = beyond_exponent(constraints.stiffness[i, e] * constraints.dent_compliance[i, e])
+    dent_powers = steep * dent_exponents(instances, i) + (steep - wp.float64(1.0)) * stiffness_powers
     by = step.constraint_gain[i, e]
     normal_gain = by[0] * stiffness_powers + by[1] * dent_powers
     # k_t is that of the spring of friction and of the dent along the surface in series

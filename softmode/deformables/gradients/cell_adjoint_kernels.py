@@ -16,7 +16,6 @@ from softmode.deformables.contact.cell_kernels import (
     PI,
     CellShape,
     Surface,
-    ahead_of,
     cell_at,
     fade_of,
     gradient_of,
@@ -25,12 +24,13 @@ from softmode.deformables.contact.cell_kernels import (
     touched_share,
     write_row,
 )
-from softmode.deformables.contact.detection_kernels import Shapes, curvature_of, shape_area, shape_drift
+from softmode.deformables.contact.detection_kernels import Shapes, curvature_of, motion_of_cell, shape_area
 from softmode.deformables.contact.penalty_kernels import (
     BULK_FACTOR,
     HARDENING,
     HARDENING_DEPTH,
     HARDENING_RANGE,
+    beyond_exponent,
     dent_exponents,
     penalty,
     stiffness_exponents,
@@ -122,7 +122,6 @@ def accumulate_cells(
         return
     zero = wp.float64(0.0)
     half = wp.float64(0.5)
-    count = instances.function_count[i]
     row = constraints.partner_row[i, e]
     shape = constraints.shape[i, e]
     n = constraints.normal[i, e]
@@ -142,10 +141,7 @@ def accumulate_cells(
     lead_bar = force_bar * (share * curvature + steep)
     depth_bar = step.normal_bar[i, e][2] - force_bar * steep * depth
 
-    start = gradient_of(instances, basis, motion.q_start, i, row)
-    ahead, closing = ahead_of(instances, basis, motion, start, n, i, row, dt)
-    x = wp.vec3(samples.position[i, row - instances.row_start[i]])
-    closing -= wp.dot(n, wp.vec3d(shape_drift(shapes, shape, x, dt)))
+    start, ahead, closing = motion_of_cell(instances, basis, motion, shapes, samples, i, row, shape, n, dt)
     gap = gap_of(instances, samples, i, row, shape)
     other = curvature_of(shapes, shape, n)
     cell_shape = shape_of_cell(surface, instances, basis, i, row, other)
@@ -154,7 +150,7 @@ def accumulate_cells(
     centre_bar = wp.vec3d()
     if constraints.row[i, e] != row:
         moved = gradient_of(instances, basis, q, i, row) - start
-        pulled = displacement_gradient(basis.row_gradient, costate, i, row, count)
+        pulled = displacement_gradient(basis.row_gradient, costate, i, row, instances.function_count[i])
         centre_bar = wp.transpose(pulled) * constraints.force[i, e] - wp.transpose(moved) * back
         centre_bar += along * (wp.transpose(ahead - start) * n)
         centre_bar += wp.transpose(start) * turned_back(shapes, shape, back, dt)
@@ -179,13 +175,15 @@ def accumulate_cells(
                 by_gap += change
                 by_fade -= (wp.float64(1.0) - y) * change
 
-    by_log = by_ratio * ratio
+    exponent = beyond_exponent(ratio)
+    by_log = by_ratio * ratio * exponent
     spared_bar = zero
     if spared > zero:
         own = depth_bar * (wp.float64(1.0) - HARDENING_DEPTH * cell_shape.least / depth)  # a part no dent shifts
-        spared_bar = (step.normal_bar[i, e][1] + own + by_log) / spared
+        spared_bar = (exponent * step.normal_bar[i, e][1] + own + by_log) / spared
         spared_bar *= wp.float64(2.0) * wp.sqrt(wp.max(wp.float64(1.0) - spared, zero))  # by -c
     step.cell_spared[i, e] = spared_bar
+    step.cell_fade[i, e] = wp.vec2d(fade * neighbour_at(cell_shape, fade, zero), fade)
     fade_bar = spared_bar * by_fade
     step.cell_gradient[i, e] = by_F + fade_bar * fade_F + along * wp.outer(n, cell.centre)
     step.cell_place[i, e] = by_place * n
@@ -193,12 +191,12 @@ def accumulate_cells(
     # lengths grow with the scale, but not the radius of what is touched
     above = half * spared_bar * by_gap
     bend_bar = by_shape.bend + fade_bar * fade_shape.bend + above
-    area = wp.float64(instances.scale[i] * instances.scale[i] * basis.row_area[row])
     by_scale = depth_bar + fade_bar * fade_shape.fade * cell_shape.fade
     by_scale += (by_shape.steepest + fade_bar * fade_shape.steepest) * cell_shape.steepest
     by_scale += (by_shape.least - above) * cell_shape.least
     if cell_shape.bend > zero:
-        by_scale += bend_bar * (cell_shape.bend + area * wp.float64(other) / (wp.float64(2.0) * PI))
+        area = instances.scale[i] * instances.scale[i] * basis.row_area[row]
+        by_scale += bend_bar * (cell_shape.bend + wp.float64(area * other) / (wp.float64(2.0) * PI))
     firm = surface.relative_stiffness[row] * surface.slenderness[row]
     powers = stiffness_exponents(instances, i, BULK_FACTOR, firm, shape_area(shapes, shape), dt)
     powers = by_log * (powers + dent_exponents(instances, i))
@@ -225,10 +223,7 @@ def restore_rows(
         return
     shape = constraints.shape[i, e]
     n = constraints.normal[i, e]
-    start = gradient_of(instances, basis, motion.q_start, i, row)
-    ahead, closing = ahead_of(instances, basis, motion, start, n, i, row, dt)
-    x = wp.vec3(samples.position[i, row - instances.row_start[i]])
-    closing -= wp.dot(n, wp.vec3d(shape_drift(shapes, shape, x, dt)))
+    _start, ahead, closing = motion_of_cell(instances, basis, motion, shapes, samples, i, row, shape, n, dt)
     cell_shape = shape_of_cell(surface, instances, basis, i, row, curvature_of(shapes, shape, n))
     ratio = constraints.stiffness[i, e] * constraints.dent_compliance[i, e]
     cell = cell_at(cell_shape, ahead, n, gap_of(instances, samples, i, row, shape), closing, ratio)
@@ -238,13 +233,9 @@ def restore_rows(
 @wp.kernel
 def spread_over_neighbours(
     instances: Instances,
-    basis: Basis,
-    motion: Motion,
-    shapes: Shapes,
     samples: Samples,
     surface: Surface,
     constraints: PointConstraints,
-    dt: float,
     # In and out:
     step: Linearised,
 ):
@@ -256,19 +247,14 @@ def spread_over_neighbours(
         if step.cell_spared[i, e] == wp.float64(0.0):
             continue
         row = constraints.partner_row[i, e]
-        shape = constraints.shape[i, e]
-        n = constraints.normal[i, e]
-        start = gradient_of(instances, basis, motion.q_start, i, row)
-        ahead, _closing = ahead_of(instances, basis, motion, start, n, i, row, dt)
-        cell_shape = shape_of_cell(surface, instances, basis, i, row, curvature_of(shapes, shape, n))
-        fade = fade_of(cell_shape, ahead, n)
         for m in range(surface.start[row], surface.start[row + 1]):
             t = surface.neighbour[m]
             for slot in range(SLOTS):
-                if samples.shape[i, t, slot] == shape:
-                    y = neighbour_at(cell_shape, fade, samples.gap[i, t, slot])
-                    change = wp.float64(surface.weight[m]) * slope_of_touching(y) / fade
-                    step.sample_place[i, t] = step.sample_place[i, t] + step.cell_spared[i, e] * change * n
+                if samples.shape[i, t, slot] == constraints.shape[i, e]:
+                    y = (step.cell_fade[i, e][0] - samples.gap[i, t, slot]) / step.cell_fade[i, e][1]
+                    change = wp.float64(surface.weight[m]) * step.cell_spared[i, e] * slope_of_touching(y)
+                    pull = change / step.cell_fade[i, e][1] * constraints.normal[i, e]
+                    step.sample_place[i, t] = step.sample_place[i, t] + pull
 
 
 @wp.kernel

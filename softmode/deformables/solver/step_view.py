@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from softmode.deformables.contact.pair_kernels import Pairs
 from softmode.deformables.model.layout import Layout
@@ -78,6 +79,14 @@ class StepView:
     def constraint_max(self) -> int:
         """Point constraints that an instance has room for."""
         return self.tables.constraints.row.shape[1]
+
+    def settled(self) -> NDArray[np.float64]:
+        """Return how far the last step moved each body (rms) over its size, shape (instance_count,): 0 at rest.
+
+        Judge rest by it and not by time: what is viscous creeps for long. Reads from the device.
+        """
+        moved = self.tables.arrays.q.numpy() - self.motion.q_start.numpy()
+        return np.sqrt((moved**2).reshape(len(moved), -1).sum(axis=1)) / self.instances.size.numpy()
 
     def last_step(self) -> tuple[Instances, Basis, Motion, PointConstraints, wp.array]:
         """Return what kernels that sum over point constraints take."""
