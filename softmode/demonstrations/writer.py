@@ -259,7 +259,7 @@ class DatasetWriter:
         self._check_open()
         found = read_metadata(folder)
         self._check_same(found, folder)
-        tasks, tables, parts = dict(self._tasks), {}, []
+        pa, tasks, tables, parts = schema.arrow(), dict(self._tasks), {}, []
         start, end = self.frame_count, 0
         for row, known in list(zip(found.rows, found.statistics, strict=True))[:count]:
             where = str(file_of(row, "data"))
@@ -270,10 +270,9 @@ class DatasetWriter:
             task = tasks.setdefault(row["tasks"][0], len(tasks))
             numbers = {"index": start + end + np.arange(length)}
             numbers |= {n: np.full(length, k) for n, k in (("episode_index", number), ("task_index", task))}
-            table = whole.slice(row["dataset_from_index"] - first, length)
-            for name, values in numbers.items():
-                column = table.schema.get_field_index(name)
-                table = table.set_column(column, table.schema.field(column), schema.arrow().array(values))
+            kept = whole.slice(row["dataset_from_index"] - first, length)
+            columns = [pa.array(numbers[name]) if name in numbers else kept[name] for name in self._schema.names]
+            table = pa.table(columns, schema=self._schema)
             films = {
                 name: folder / schema.VIDEO_PATH.format(video_key=name, **file_of(row, f"videos/{name}"))
                 for name, kind in self.features.items()
