@@ -25,6 +25,14 @@ from tests.needs import needs
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULT = f"done {COUNT} {b''.join(bytes([n]) * n for n in range(COUNT)).hex()}"
+ENVIRONMENT = {
+    **os.environ,
+    "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]),
+    "OMP_NUM_THREADS": "1",
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_AUTH_MODE": "token",
+    "RAY_AUTH_TOKEN": "0" * 64,
+}
 JOB = {"work": "square", "bodies": ["a"]}
 
 
@@ -90,14 +98,12 @@ def test_a_cluster_that_is_not_there(tmp_path: Path, address: str, error: type[E
 @contextlib.contextmanager
 def cluster(port: int, *, workers: int = 2) -> Iterator[int]:
     """Run a cluster on this machine; yield the process group that ends it."""
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
-    environment |= {"RAY_USAGE_STATS_ENABLED": "0", "OMP_NUM_THREADS": "1"}
     with tempfile.TemporaryDirectory(prefix="ray", ignore_cleanup_errors=True) as folder:  # whose path must be short
         words = ["start", "--head", "--block", f"--port={port}", f"--num-cpus={workers}", f"--temp-dir={folder}"]
         words += ["--node-ip-address=127.0.0.1", "--include-dashboard=false", "--object-store-memory=100000000"]
         head = subprocess.Popen(
             [sys.executable, "-m", "ray.scripts.scripts", *words],
-            env=environment,
+            env=ENVIRONMENT,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
             start_new_session=True,
@@ -130,7 +136,7 @@ def driver(port: int, job: dict[str, Any], shards: Path) -> subprocess.Popen[str
     """Start the work in a process of its own."""
     words = [f"127.0.0.1:{port}", json.dumps(job), str(shards)]
     command = [sys.executable, "-m", "tests.cluster.work", *words]
-    return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    return subprocess.Popen(command, cwd=ROOT, env=ENVIRONMENT, stdout=subprocess.PIPE, text=True)
 
 
 def begun(folder: Path) -> list[tuple[int, int]]:
