@@ -41,6 +41,10 @@ CASES = {
     "Stable-Baselines3": ("rl", "from softmode.envs.adapters import StableBaselinesVecEnv"),
     "rsl_rl": ("rsl-rl", "from softmode.envs.adapters import RslRlVecEnv"),
     "skrl": ("skrl", "from softmode.envs.adapters import SkrlWrapper"),
+    "cluster": (
+        "ray",
+        "from softmode.cluster import Shards, run_shards; run_shards('local', None, {}, Shards(Path('s'), {}), [0])",
+    ),
     "training": ("rl", "from softmode.learning.trainer import train"),
     "trained policy": ("rl", "from softmode.learning.policy import load_policy"),
     "policy by file": (
