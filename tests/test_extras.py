@@ -24,6 +24,7 @@ OPTIONAL = (
         "stable_baselines3",
         "rsl_rl",
         "skrl",
+        "ray",
         "onnxruntime",
         "pyarrow",
         "imageio",

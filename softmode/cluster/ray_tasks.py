@@ -64,14 +64,14 @@ def run_shards(
         StorageError: If there is no space here or on the workers.
         MissingExtraError: If Ray is not installed.
     """
-    owners: dict[Any, Any] = {0: job.get("owner")}
+    owners = {0: job["owner"]} if job.get("owner") else {}
     processors: dict[str, None] = {}
 
     def known(facts: dict[str, Any]) -> None:
-        case, owner = facts.get("case", 0), facts.get("owner")
-        if owner != (owners.setdefault(case, owner) or owner):
+        owner = facts.get("owner")
+        if owner != (wanted := owners.setdefault(facts.get("case", 0), owner)):
             raise ConfigError(
-                f"a worker on {facts['host']} has built {owner}, not {owners[case]}",
+                f"a worker on {facts['host']} has built {owner}, not {wanted}",
                 hint="install the same versions and the same files on all machines",
             )
         if facts["processor"] not in processors:
