@@ -44,7 +44,7 @@ CASES = {
     "skrl": ("skrl", "from softmode.envs.adapters import SkrlWrapper"),
     "cluster": (
         "ray",
-        "from softmode.cluster import Shards, run_shards; run_shards('local', None, {}, Shards(Path('s'), {}), [0])",
+        "from softmode.cluster.ray_tasks import _cluster; _cluster('local', None).__enter__()",
     ),
     "training": ("rl", "from softmode.learning.trainer import train"),
     "trained policy": ("rl", "from softmode.learning.policy import load_policy"),

@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING, Any
 
 from softmode import __version__
 from softmode.cli.common import bar_interval
-from softmode.cluster import Shards, run_shards
+from softmode.cluster.ray_tasks import run_shards
+from softmode.cluster.shards import Shards
 from softmode.demonstrations.recording import ATTEMPTS, Recorded, environment_features, record_episodes
 from softmode.errors import ConfigError
 from softmode.learning.config_values import with_config
@@ -122,7 +123,7 @@ def record_on_ray(
     """Record a dataset on a cluster, of the first episodes by their seeds: that of a recording here, bit by bit.
 
     Args:
-        address: See :func:`softmode.cluster.run_shards`, which has the errors too, and further options.
+        address: See :func:`softmode.cluster.ray_tasks.run_shards`, which has the errors too, and further options.
         job: What is to be recorded.
         out: Folder of the dataset, not there yet. Until it is, the shards lie beside it, and the same job goes on from
             them.
@@ -255,7 +256,7 @@ def evaluate_on_ray(
     """Yield every combination of options and how the policy did with it, each episode from a seed of its own.
 
     Args:
-        address: See :func:`softmode.cluster.run_shards`, which has the errors too, and further options.
+        address: See :func:`softmode.cluster.ray_tasks.run_shards`, which has the errors too, and further options.
         job: What is to be evaluated.
         out: Where shards are kept, at this name with ``.shards``, until all is done.
         options: Of `run_shards`.

@@ -10,7 +10,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from softmode.cluster import Shards, run_shards
+from softmode.cluster.ray_tasks import run_shards
+from softmode.cluster.shards import Shards
 from softmode.errors import SoftmodeError, StorageError
 
 COUNT = 14
