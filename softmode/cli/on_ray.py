@@ -8,7 +8,6 @@ import itertools
 import json
 import os
 import shutil
-import sys
 import tarfile
 import tempfile
 from collections.abc import Iterator, Mapping
@@ -16,7 +15,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from softmode import __version__
-from softmode.cli.common import bar_interval
 from softmode.cluster.ray_tasks import run_shards
 from softmode.cluster.shards import Shards
 from softmode.demonstrations.recording import ATTEMPTS, Recorded, environment_features, record_episodes
@@ -52,10 +50,6 @@ def owner_of(env: Any) -> dict[str, str] | None:
 def folder_of(out: Path) -> Path:
     """Return where the shards of a result lie until it is there."""
     return out.with_name(out.name + ".shards")
-
-
-def _gpus(job: Mapping[str, Any]) -> float:
-    return float(str(job["device"]).startswith("cuda"))
 
 
 def _check_policy_file(job: Mapping[str, Any]) -> None:
@@ -130,15 +124,9 @@ def record_on_ray(
         origin: Where the episodes come from, for the dataset.
         options: Of `run_shards`.
     """
-    from tqdm import tqdm
-
-    with (
-        Shards(folder_of(out), job) as shards,
-        tqdm(total=job["episodes"], desc="recording", unit="episode", mininterval=bar_interval()) as bar,
-    ):
-        _tell_damage(shards, bar)
-        order: list[int] = []  # shards from the first one on without a gap, until there are enough
-        have = 0
+    order: list[int] = []  # shards from the first one on without a gap, until there are enough
+    have = 0
+    with Shards(folder_of(out), job) as shards:
 
         def enough() -> bool:
             nonlocal have
@@ -147,13 +135,8 @@ def record_on_ray(
                 order.append(len(order))
             return have >= job["episodes"]
 
-        def told(facts: Mapping[str, Any]) -> None:
-            bar.update(min(facts["episodes"], job["episodes"] - bar.n))
-
-        for facts in shards.facts.values():
-            told(facts)
-        numbers = range(len(_seeds(job)))
-        run_shards(address, record_shard, job, shards, numbers, enough=enough, told=told, gpus=_gpus(job), **options)
+        options |= {"total": job["episodes"], "enough": enough}
+        run_shards(address, record_shard, job, shards, range(len(_seeds(job))), **options)
         enough()
         outcomes = [success for number in order for success in shards.facts[number]["outcomes"]]
         counted = [success for success in outcomes if success or not job["only_successes"]][: job["episodes"]]
@@ -194,11 +177,6 @@ def _merge(shards: Shards, order: list[int], episodes: int, out: Path, origin: M
         if writer is not None:
             writer.close()
     os.rename(made, out)
-
-
-def _tell_damage(shards: Shards, bar: Any) -> None:
-    for name in shards.damaged:
-        bar.write(f"softmode: shard {name} was damaged and is done again; the others are used", file=sys.stderr)
 
 
 # -- evaluation -------------------------------------------------------------------------------------------------------
@@ -247,7 +225,7 @@ def evaluate_shard(job: Mapping[str, Any], number: int) -> tuple[dict[str, Any],
     count = min(job["num_envs"], job["episodes"] - done)
     found = played(env, policy, count, seed=job["seed"] + done, device=job["device"])
     outcomes = [None if column is None else column.tolist() for column in found]
-    return {"owner": owner_of(env), "case": case, "outcomes": outcomes}, b""
+    return {"owner": owner_of(env), "case": case, "episodes": count, "outcomes": outcomes}, b""
 
 
 def evaluate_on_ray(
@@ -261,21 +239,12 @@ def evaluate_on_ray(
         out: Where shards are kept, at this name with ``.shards``, until all is done.
         options: Of `run_shards`.
     """
-    from tqdm import tqdm
-
     from softmode.learning.policy import summary
 
-    cases = combinations(job["over"])
-    each = -(-job["episodes"] // job["num_envs"])
-    with (
-        Shards(folder_of(out), job) as shards,
-        tqdm(total=each * len(cases), desc="evaluating", unit="shard", mininterval=bar_interval()) as bar,
-    ):
-        _tell_damage(shards, bar)
-        bar.update(len(shards.facts))
-        numbers = range(each * len(cases))
-        options = {"told": lambda facts: bar.update(), "gpus": _gpus(job), **options}
-        run_shards(address, evaluate_shard, job, shards, numbers, **options)
+    cases, each = combinations(job["over"]), -(-job["episodes"] // job["num_envs"])
+    with Shards(folder_of(out), job) as shards:
+        options |= {"total": job["episodes"] * len(cases)}
+        run_shards(address, evaluate_shard, job, shards, range(each * len(cases)), **options)
         for case, chosen in enumerate(cases):
             yield chosen, summary([shards.facts[case * each + k]["outcomes"] for k in range(each)])
         shards.remove()

@@ -36,16 +36,16 @@ def run_shards(
     shards: Shards,
     numbers: Iterable[int],
     *,
+    total: int,
     enough: Callable[[], bool] = lambda: False,
-    told: Callable[[dict[str, Any]], None] = lambda facts: None,
-    gpus: float = 0.0,
     patience: float = 60.0,
 ) -> None:
     """Do the shards of a job that are not there yet, on the machines of a Ray cluster.
 
     A worker that dies has its shard done again by Ray, one that stands still by this function. What a shard holds
-    depends on the job and its number alone, so it does not matter who does it. Facts that have an ``owner`` (the bodies
-    that the worker has built) must agree with those of the other shards of the same ``case``.
+    depends on the job and its number alone, so it does not matter who does it. A job whose ``device`` is a CUDA device
+    takes a GPU for each shard. Facts that have an ``owner`` (the bodies that the worker has built) must agree with
+    those of the other shards of the same ``case``; ``episodes`` is how many there are.
 
     Args:
         address: HOST:PORT of the head; ``auto`` for the cluster that runs on this machine, ``local`` to start one here.
@@ -53,9 +53,8 @@ def run_shards(
         job: What it is part of.
         shards: Where shards go.
         numbers: Which ones, in the order of their need.
+        total: Episodes that are wanted, for the bar.
         enough: Whether no more are needed.
-        told: Called with the facts of every shard that is done.
-        gpus: GPUs of a shard.
         patience: Least time without a shard after which those that are given out are given out again [s].
 
     Raises:
@@ -64,6 +63,8 @@ def run_shards(
         StorageError: If there is no space here or on the workers.
         MissingExtraError: If Ray is not installed.
     """
+    from tqdm import tqdm
+
     owners = {0: job["owner"]} if job.get("owner") else {}
     processors: dict[str, None] = {}
 
@@ -79,14 +80,19 @@ def run_shards(
             if len(processors) > 1:
                 names = ", ".join(processors)
                 print(f"softmode: shards come from several processors, whose bits differ: {names}", file=sys.stderr)
+        bar.update(min(facts.get("episodes", 1), total - bar.n))
 
-    for facts in shards.facts.values():
-        known(facts)
-    missing = (number for number in numbers if number not in shards.facts)
-    if enough() or (first := next(missing, None)) is None:
-        return
-    with _cluster(address, shards) as (ray, alive):
-        options = {"num_cpus": 1, "num_gpus": gpus, "max_retries": RETRIES, "retry_exceptions": [StorageError]}
+    with contextlib.ExitStack() as stack:
+        kind = work.__name__.partition("_")[0]
+        bar = stack.enter_context(tqdm(total=total, desc=kind, unit="episode", mininterval=1.0))
+        for facts in shards.facts.values():
+            known(facts)
+        missing = (number for number in numbers if number not in shards.facts)
+        if enough() or (first := next(missing, None)) is None:
+            return
+        ray, alive = stack.enter_context(_cluster(address, shards.folder))
+        options = {"num_cpus": 1, "num_gpus": float(str(job.get("device")).startswith("cuda"))}
+        options |= {"max_retries": RETRIES, "retry_exceptions": [StorageError]}
         remote = ray.remote(**options)(_do)
         given: dict[Any, tuple[int, float]] = {}
 
@@ -105,9 +111,7 @@ def run_shards(
                 if number not in shards.facts:  # else it was given out twice
                     last = time.monotonic()
                     longest = max(longest, last - since)
-                    facts = shards.put(number, *ray.get(done))
-                    known(facts)
-                    told(facts)
+                    known(shards.put(number, *ray.get(done)))
             if time.monotonic() - last > (max(patience, LATER * longest) if longest else FIRST_PATIENCE):
                 last = time.monotonic()
                 for number in {number for number, _ in given.values()} - set(shards.facts):
@@ -138,11 +142,11 @@ def processor() -> str:
 
 
 @contextlib.contextmanager
-def _cluster(address: str, shards: Shards) -> Iterator[tuple[Any, Callable[[], None]]]:
+def _cluster(address: str, folder: Path) -> Iterator[tuple[Any, Callable[[], None]]]:
     """Yield Ray, connected to a cluster, and what raises WorkerError once its head is lost."""
     with needs_extra("ray", "work on several machines needs Ray"):
         import ray
-    hint = f"start the cluster and give the same command again, which goes on from what is in {shards.folder}"
+    hint = f"start the cluster and give the same command again, which goes on from what is in {folder}"
 
     def reach(where: str) -> None:
         host, _, port = where.rpartition(":")

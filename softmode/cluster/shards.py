@@ -7,6 +7,7 @@ import json
 import os
 import re
 import shutil
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -28,8 +29,8 @@ def packed(facts: Mapping[str, Any], payload: bytes) -> tuple[bytes, str]:
 class Shards:
     """The shards of a job that are done.
 
-    A shard is whole or not there. One whose content has another hash than its name says is removed and named in
-    `damaged`; the others stay usable. A lock keeps a second run out.
+    A shard is whole or not there. One whose content has another hash than its name says is removed and named, and the
+    others stay usable. A lock keeps a second run out.
 
     Args:
         folder: Where they lie; made if it is not there.
@@ -45,10 +46,7 @@ class Shards:
         self.folder = folder
         self.facts: dict[int, dict[str, Any]] = {}
         """What is known of the shards that are done, by number."""
-        self.damaged: list[str] = []
-        """Names of those that were damaged."""
         self._paths: dict[int, Path] = {}
-        self._lock: int | None = None
         with storage_errors(f"folder of shards {folder}", hint="choose another place"):
             folder.mkdir(parents=True, exist_ok=True)
             self._lock = os.open(folder, os.O_RDONLY)
@@ -57,7 +55,12 @@ class Shards:
                     raise ConfigError(f"{folder} is being written by another run", hint="wait for its end")
                 self._check_plan(json.loads(json.dumps(job)))
                 for path in sorted(folder.glob("*.shard")):
-                    self._look_at(path)
+                    try:
+                        facts, number = _opened(path)[0], int(path.name[:7])
+                        self.facts[number], self._paths[number] = facts, path
+                    except AssetError as error:
+                        print(f"softmode: {error.message}; it is done again, the others are used", file=sys.stderr)
+                        path.unlink()
             except BaseException:
                 self.close()
                 raise
@@ -65,31 +68,19 @@ class Shards:
     def _check_plan(self, job: dict[str, Any]) -> None:
         """Write what the job is, or compare it with what is there."""
         plan = self.folder / PLAN
-        if not plan.exists():
-            if any(self.folder.iterdir()):
-                raise ConfigError(f"{self.folder} holds something else than shards", hint="choose another place")
-            with PendingFile(plan) as file:
-                file.temporary.write_text(json.dumps(job, indent=1), encoding="utf-8")
-            return
-        found = read_json(plan, "plan of shards", hint="remove the folder to begin anew")
-        for name in job if isinstance(found, dict) else ():
-            if found.get(name) != job[name]:
+        if plan.exists():
+            found = dict(read_json(plan, "plan of shards", hint="remove the folder to begin anew"))
+            if others := [name for name in job if found.get(name) != job[name]]:
                 raise ConfigError(
-                    f"{self.folder} holds shards of another command, whose {name} is {found.get(name)!r} and not "
-                    f"{job[name]!r}",
+                    f"{self.folder} holds shards of another command, whose {others[0]} is {found.get(others[0])!r} and "
+                    f"not {job[others[0]]!r}",
                     hint="give the same command, remove the folder, or choose another place",
                 )
-
-    def _look_at(self, path: Path) -> None:
-        """Take over a shard that is whole."""
-        named = _NAME.fullmatch(path.name)
-        try:
-            facts = _opened(path)[0]
-        except AssetError:
-            self.damaged.append(path.name)
-            path.unlink()
-            return
-        self.facts[int(named[1])], self._paths[int(named[1])] = facts, path  # type: ignore[index]
+        elif any(self.folder.iterdir()):
+            raise ConfigError(f"{self.folder} holds something else than shards", hint="choose another place")
+        else:
+            with PendingFile(plan) as file:
+                file.temporary.write_text(json.dumps(job, indent=1), encoding="utf-8")
 
     def put(self, number: int, content: bytes, digest: str) -> dict[str, Any]:
         """Keep a shard; return what is known of it.
@@ -117,9 +108,9 @@ class Shards:
 
     def close(self) -> None:
         """Let go of the folder; harmless twice."""
-        if self._lock is not None:
+        if self._lock >= 0:
             os.close(self._lock)
-            self._lock = None
+            self._lock = -1
 
     def __enter__(self) -> Shards:
         """Return the shards."""

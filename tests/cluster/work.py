@@ -35,7 +35,7 @@ def drive(address: str, job: dict[str, Any], shards: Path) -> None:
     """Do the shards of a job, and print what comes of it."""
     try:
         with Shards(shards, job) as kept:
-            run_shards(address, globals()[job["work"]], job, kept, range(COUNT), patience=4.0)
+            run_shards(address, globals()[job["work"]], job, kept, range(COUNT), total=COUNT, patience=4.0)
             print("done", len(kept.facts), b"".join(kept.payload(n) for n in range(COUNT)).hex())
     except SoftmodeError as error:
         print(type(error).__name__, error)
