@@ -111,7 +111,7 @@ def run_shards(
                 if number not in shards.facts:  # else it was given out twice
                     last = time.monotonic()
                     longest = max(longest, last - since)
-                    known(shards.put(number, *ray.get(done)))
+                    shards.put(number, *ray.get(done), known)
             if time.monotonic() - last > (max(patience, LATER * longest) if longest else FIRST_PATIENCE):
                 last = time.monotonic()
                 for number in {number for number, _ in given.values()} - set(shards.facts):

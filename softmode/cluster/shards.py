@@ -8,7 +8,7 @@ import os
 import re
 import shutil
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -82,8 +82,10 @@ class Shards:
             with PendingFile(plan) as file:
                 file.temporary.write_text(json.dumps(job, indent=1), encoding="utf-8")
 
-    def put(self, number: int, content: bytes, digest: str) -> dict[str, Any]:
-        """Keep a shard; return what is known of it.
+    def put(
+        self, number: int, content: bytes, digest: str, check: Callable[[dict[str, Any]], None] = lambda facts: None
+    ) -> None:
+        """Keep a shard, unless the check of what is known of it raises.
 
         Raises:
             AssetError: If the content has another hash.
@@ -92,9 +94,9 @@ class Shards:
         path = self.folder / f"{number:07d}-{digest}.shard"
         with PendingFile(path, "shard") as file:
             file.temporary.write_bytes(content)
-            self.facts[number] = _opened(file.temporary, digest)[0]
-        self._paths[number] = path
-        return self.facts[number]
+            facts = _opened(file.temporary, digest)[0]
+            check(facts)
+        self.facts[number], self._paths[number] = facts, path
 
     def payload(self, number: int) -> bytes:
         """Return what a shard holds; raises AssetError if it is damaged or missing."""

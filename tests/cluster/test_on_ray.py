@@ -23,14 +23,13 @@ ENV_ID = "softmode/PushSoft-v0"
 POLICY = Path(__file__).resolve().parents[2] / "policies" / "push_soft.npz"
 
 
-def filled(out: Path, job: dict[str, Any], work: Any, order: tuple[int, ...]) -> list[dict[str, Any]]:
+def filled(out: Path, job: dict[str, Any], work: Any, order: tuple[int, ...]) -> dict[int, dict[str, Any]]:
     """Do the shards of a job here; return what is known of each."""
     with Shards(on_ray.folder_of(out), job) as shards:
-        return [
+        for number in order:
+            facts, payload = work(job, number)
             shards.put(number, *packed({"processor": "a", **facts}, payload))
-            for number in order
-            for facts, payload in [work(job, number)]
-        ]
+        return shards.facts
 
 
 @needs("pyarrow")
@@ -43,7 +42,7 @@ def test_shards_make_the_dataset_of_one_recording(tmp_path: Path, capsys: pytest
     job = on_ray.job_of("scripted", **job, device="cpu", robot="softmode_arm", owner=None)
     out = tmp_path / "there"
     facts = filled(out, job, on_ray.record_shard, (1, 0))
-    assert [len(fact["outcomes"]) for fact in facts] == [1, 2] and facts[0]["owner"]["task"] == "PushSoft"
+    assert [len(facts[number]["outcomes"]) for number in (0, 1)] == [2, 1] and facts[0]["owner"]["task"] == "PushSoft"
     origin = {"env": ENV_ID, "env_options": job["env_options"]}
     assert on_ray.record_on_ray("127.0.0.1:1", job, out, origin).attempts == 3  # all is there: nobody is asked
     for path in (tmp_path / "here").rglob("*.*"):
