@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from softmode.envs import env_spec
+from softmode.errors import MissingExtraError
 from tests.modules import load
 
 PACKAGE = Path(__file__).resolve().parents[1] / "packages" / "lerobot_env_softmode"
@@ -22,6 +23,9 @@ PACKAGE = Path(__file__).resolve().parents[1] / "packages" / "lerobot_env_softmo
 def test_worlds_are_as_the_loops_of_lerobot_expect(obs_type: str, capsys: pytest.CaptureFixture[str]) -> None:
     """Names, batches, pictures of every world, the reset's mark; success by both rules is counted and said."""
     module = load(PACKAGE / "lerobot_env_softmode" / "worlds.py")  # it needs no LeRobot, which is not installed here
+    module.check_version("0.6.1")
+    with pytest.raises(MissingExtraError, match=r"0\.7\.0 is installed"):
+        module.check_version("0.7.0")
     options = {} if obs_type == "state" else {"image_size": 36}
     env = module.make_worlds(
         "softmode/LiftSoft-v0", 2, camera="front", obs_type=obs_type, max_episode_steps=2, **options

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib.metadata import version
 from typing import Any
 
 import gymnasium as gym
+
+from lerobot_env_softmode.worlds import SoftmodeWorlds, check_version, make_worlds, named_space
+from softmode.envs import env_spec
+
+check_version(version("lerobot"))  # before its names are imported, which move
+# ruff: noqa: E402
+
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
-
-from lerobot_env_softmode.worlds import SoftmodeWorlds, make_worlds, named_space
-from softmode.envs import env_spec
 
 __all__ = ["SoftmodeEnv", "SoftmodeWorlds", "make_worlds"]
 

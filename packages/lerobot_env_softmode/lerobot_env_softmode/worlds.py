@@ -14,6 +14,15 @@ NEW_ROLLOUT = "lerobot_new_rollout"
 """Reset option by which LeRobot marks the first episodes of a rollout."""
 
 
+def check_version(found: str) -> None:
+    """Raise MissingExtraError for a version of LeRobot that this package was not made for."""
+    from softmode.errors import MissingExtraError
+
+    if found.split(".")[:2] != ["0", "6"] or found == "0.6.0":
+        hint = "install it with: pip install 'lerobot>=0.6.1,<0.7'"
+        raise MissingExtraError(f"LeRobot {found} is installed, and this package is for 0.6.1 up to 0.7", hint=hint)
+
+
 def make_worlds(env_id: str, count: int, *, camera: str, **options: Any) -> SoftmodeWorlds:
     """Make a task's vector environment for LeRobot.
 
