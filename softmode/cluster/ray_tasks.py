@@ -101,20 +101,23 @@ def run_shards(
 
         give(first)
         longest, last = 0.0, time.monotonic()
-        while given and not enough():
+        while not enough():
             # Two for each processor: one is worked on, one waits.
             while len(given) < 2 * ray.cluster_resources().get("CPU", 1) and (n := next(missing, None)) is not None:
                 give(n)
+            if not (awaited := {number for number, _ in given.values()} - set(shards.facts)):
+                break
             ready, _ = ray.wait(list(given), timeout=1.0)
             for done in ready:
                 number, since = given.pop(done)
-                if number not in shards.facts:  # else it was given out twice
+                if number in awaited:  # else it was given out twice
                     last = time.monotonic()
                     longest = max(longest, last - since)
                     shards.put(number, *ray.get(done), known)
+                    awaited.remove(number)
             if time.monotonic() - last > (max(patience, LATER * longest) if longest else FIRST_PATIENCE):
                 last = time.monotonic()
-                for number in {number for number, _ in given.values()} - set(shards.facts):
+                for number in awaited:
                     give(number)
             alive()
         for left in given:
