@@ -176,6 +176,7 @@ def _merge(shards: Shards, order: list[int], episodes: int, out: Path, origin: M
     finally:
         if writer is not None:
             writer.close()
+    os.sync()
     os.rename(made, out)
 
 

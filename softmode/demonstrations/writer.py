@@ -245,7 +245,8 @@ class DatasetWriter:
     def take_dataset(self, folder: Path, count: int | None = None) -> None:
         """Add the episodes of a dataset that another writer has written, as if they had been recorded here.
 
-        Its films are moved, so that nothing of it can be used afterwards.
+        Its films are moved, so that nothing of it can be used afterwards. Files are in place, but a power failure may
+        lose them until the caller has called ``os.sync``: many datasets need one such call.
 
         Args:
             folder: The dataset, on the same file system.
@@ -283,7 +284,7 @@ class DatasetWriter:
             parts.append(_Part(row["tasks"][0], table, known, films, state.read_bytes() if state.exists() else None))
             end += length
         with storage_errors(f"dataset {self.folder}", hint="free some space"):
-            self._put(parts)
+            self._put(parts, durable=False)
 
     def _save(self, task: str, state: bytes | None) -> None:
         """Add the present episode."""
@@ -294,7 +295,7 @@ class DatasetWriter:
         table, films = episode.table(arrays, self._schema), {name: film.path for name, film in episode.films.items()}
         self._put([_Part(task, table, episode.statistics(arrays), films, state)])
 
-    def _put(self, parts: list[_Part]) -> None:
+    def _put(self, parts: list[_Part], *, durable: bool = True) -> None:
         """Stage the files of the dataset with further episodes, then put them in place."""
         stage = self._root / STAGE
         stage.mkdir(exist_ok=True)
@@ -339,7 +340,7 @@ class DatasetWriter:
         moves[schema.CARD_PATH] = stage / "README.md"
         moves[schema.CARD_PATH].write_text(schema.card(info, list(tasks), origins[-1] if origins else {}), "utf-8")
         moves[schema.INFO_PATH] = write_json(stage / "info.json", info)
-        for source in moves.values():
+        for source in moves.values() if durable else ():
             sync(source)
         for target, source in moves.items():
             (self._root / target).parent.mkdir(parents=True, exist_ok=True)
