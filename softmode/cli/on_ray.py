@@ -139,17 +139,18 @@ def record_on_ray(
         run_shards(address, record_shard, job, shards, range(len(_seeds(job))), **options)
         enough()
         outcomes = [success for number in order for success in shards.facts[number]["outcomes"]]
-        counted = [success for success in outcomes if success or not job["only_successes"]][: job["episodes"]]
+        wanted = [k for k, success in enumerate(outcomes) if success or not job["only_successes"]][: job["episodes"]]
+        counted = [outcomes[k] for k in wanted]
         if counted:
             _merge(shards, order, job["episodes"], out, origin)
             shards.remove()
-    if len(counted) < job["episodes"]:
+    if len(wanted) < job["episodes"]:
         raise ConfigError(
             f"only {len(counted)} of {len(outcomes)} episodes succeeded, {job['episodes']} were asked for; they are "
             "recorded",
             hint="use a better policy, or record failures too",
         )
-    return Recorded(episodes=len(counted), successes=sum(counted), attempts=len(outcomes))
+    return Recorded(episodes=len(counted), successes=sum(counted), attempts=wanted[-1] + 1)
 
 
 def _merge(shards: Shards, order: list[int], episodes: int, out: Path, origin: Mapping[str, Any]) -> None:

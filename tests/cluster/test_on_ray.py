@@ -5,8 +5,10 @@ Builds the bodies of PushSoft by its environments, as a worker does.
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
+import tarfile
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,7 @@ import pytest
 from softmode.cli import on_ray
 from softmode.cli.main import main
 from softmode.cluster.shards import Shards, packed
+from softmode.demonstrations import read_dataset
 from softmode.envs.catalogue import purpose
 from softmode.errors import ConfigError
 from tests.needs import needs
@@ -30,6 +33,12 @@ def filled(out: Path, job: dict[str, Any], work: Any, order: tuple[int, ...]) ->
             facts, payload = work(job, number)
             shards.put(number, *packed({"processor": "a", **facts}, payload))
         return shards.facts
+
+
+def nothing() -> bytes:
+    """Return what a shard without a success holds."""
+    tarfile.open(fileobj=(packed := io.BytesIO()), mode="w").close()
+    return packed.getvalue()
 
 
 @needs("pyarrow")
@@ -48,6 +57,14 @@ def test_shards_make_the_dataset_of_one_recording(tmp_path: Path, capsys: pytest
     for path in (tmp_path / "here").rglob("*.*"):
         assert path.read_bytes() == (out / path.relative_to(tmp_path / "here")).read_bytes(), path
     assert sorted(path.name for path in tmp_path.iterdir()) == ["here", "there"]
+    _, payload = on_ray.record_shard(job, 0)  # of successes the first by their seeds are taken, across shards
+    few = {**job, "only_successes": True, "episodes": 1}
+    with Shards(on_ray.folder_of(tmp_path / "few"), few) as shards:
+        for number, outcomes, kept in ((0, [False, False], nothing()), (1, [False, True, True], payload)):
+            facts = {"processor": "a", "outcomes": outcomes, "episodes": sum(outcomes)}
+            shards.put(number, *packed(facts, kept))
+    assert on_ray.record_on_ray("127.0.0.1:1", few, tmp_path / "few", origin).attempts == 4
+    assert len(read_dataset(tmp_path / "few").episode_start) == 1
     shutil.copy(POLICY, tmp_path / "policy.npz")
     other = {**job, **on_ray.job_of(tmp_path / "policy.npz")}
     (tmp_path / "policy.npz").write_bytes(b"another")
