@@ -113,7 +113,8 @@ def run_shards(
                 if number in awaited:  # else it was given out twice
                     last = time.monotonic()
                     longest = max(longest, last - since)
-                    shards.put(number, *ray.get(done), known)
+                    content, digest = ray.get(done)
+                    shards.put(number, content, digest, known)
                     awaited.remove(number)
             if time.monotonic() - last > (max(patience, LATER * longest) if longest else FIRST_PATIENCE):
                 last = time.monotonic()
