@@ -192,7 +192,7 @@ def combinations(over: Mapping[str, Any]) -> list[dict[str, Any]]:
     """
     for name, values in over.items():
         if not isinstance(values, list) or not values:
-            raise ConfigError(f"{name} is {values!r}, no list", hint="write it like size=[0.05,0.08]")
+            raise ConfigError(f"{name} is {values!r}, no list", hint="write it like yaw_range=[0.5,3.0]")
     return [dict(zip(over, chosen, strict=True)) for chosen in itertools.product(*over.values())]
 
 

@@ -122,7 +122,7 @@ class Evaluate:
     force_limit: float | None = None
     """Largest contact force of a safe success [N]; as in the policy's run, or 15, or thrice what holds the weight."""
     over: tuple[str, ...] = ()
-    """Keyword arguments of the environment to go through, as NAME=[VALUES], for example size=[0.05,0.08]; of several
+    """Keyword arguments of the environment to go through, as NAME=[VALUES], for example yaw_range=[0.5,3.0]; of several
     all combinations."""
     ray: str | None = None
     """Play on the machines of a Ray cluster, each episode from a seed of its own: HOST:PORT of its head, auto, or local
