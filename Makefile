@@ -36,7 +36,7 @@ unexport PYTHONDONTWRITEBYTECODE
 unexport VIRTUAL_ENV
 
 .DEFAULT_GOAL := help
-.PHONY: help lock resolve demo test test-fast test-rest test-slow test-lowest test-lerobot lint docs dist smoke bench accuracy baselines clean coupling
+.PHONY: help lock resolve demo test test-fast test-rest test-slow test-lowest test-lerobot test-ray lint docs dist smoke bench accuracy baselines clean coupling
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -110,6 +110,14 @@ test-lerobot: $(VENV)/.created | $(WARP_CACHE_PATH)  ## record, train and evalua
 	$(UV) pip install --quiet --python $(LEROBOT)/bin/python --editable '.[data,demo]' \
 	  --editable packages/lerobot_env_softmode 'lerobot[dataset,training]==0.6.1' 'pytest>=8.3'
 	$(LEROBOT)/bin/python -m pytest -c packages/lerobot_env_softmode/pyproject.toml packages/lerobot_env_softmode/tests $(ARGS)
+
+# RLlib asks for an older Gymnasium than the newest; Ray and what it brings are 300 MB.
+RAY := .venv-ray
+test-ray: $(VENV)/.created | $(WARP_CACHE_PATH)  ## lose workers and the head of a Ray cluster, train with RLlib, in an environment of its own
+	$(PYTHON) -m venv $(RAY)
+	$(RAY)/bin/python -m pip install --quiet '$(TORCH)'
+	$(UV) pip install --quiet --python $(RAY)/bin/python --editable '.[ray]' 'ray[rllib]==2.60.*' 'pytest>=8.3' 'hypothesis>=6.115'
+	$(RAY)/bin/python -m pytest tests/cluster tests/envs/test_frameworks.py $(ARGS)
 
 lint: $(VENV)/.dev  ## ruff, pyright, words that may not come back, names of what is not there
 	$(BIN)/ruff check .

@@ -24,6 +24,7 @@ OPTIONAL = (
         "stable_baselines3",
         "rsl_rl",
         "skrl",
+        "ray",
         "onnxruntime",
         "pyarrow",
         "imageio",
@@ -41,6 +42,10 @@ CASES = {
     "Stable-Baselines3": ("rl", "from softmode.envs.adapters import StableBaselinesVecEnv"),
     "rsl_rl": ("rsl-rl", "from softmode.envs.adapters import RslRlVecEnv"),
     "skrl": ("skrl", "from softmode.envs.adapters import SkrlWrapper"),
+    "cluster": (
+        "ray",
+        "from softmode.cluster.ray_tasks import _cluster; _cluster('local', None).__enter__()",
+    ),
     "training": ("rl", "from softmode.learning.trainer import train"),
     "trained policy": ("rl", "from softmode.learning.policy import load_policy"),
     "policy by file": (

@@ -14,7 +14,7 @@ FLOORS = (
     "softmode errors",
     "leftovers interrupts stages",
     "files checks lanes lazy pause quiet vector_check versions",
-    "deformables foreign",
+    "cluster deformables foreign",
     "splats robots mpm",
     "radiance",
     "objects",

@@ -12,6 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from softmode.envs import env_spec
+from softmode.errors import MissingExtraError
 from tests.modules import load
 
 PACKAGE = Path(__file__).resolve().parents[1] / "packages" / "lerobot_env_softmode"
@@ -21,10 +23,17 @@ PACKAGE = Path(__file__).resolve().parents[1] / "packages" / "lerobot_env_softmo
 def test_worlds_are_as_the_loops_of_lerobot_expect(obs_type: str, capsys: pytest.CaptureFixture[str]) -> None:
     """Names, batches, pictures of every world, the reset's mark; success by both rules is counted and said."""
     module = load(PACKAGE / "lerobot_env_softmode" / "worlds.py")  # it needs no LeRobot, which is not installed here
+    module.check_version("0.6.1")
+    with pytest.raises(MissingExtraError, match=r"0\.7\.0 is installed"):
+        module.check_version("0.7.0")
     options = {} if obs_type == "state" else {"image_size": 36}
     env = module.make_worlds(
         "softmode/LiftSoft-v0", 2, camera="front", obs_type=obs_type, max_episode_steps=2, **options
     )
+    found = env_spec("softmode/LiftSoft-v0", obs_type=obs_type, **options)  # what the plug-in is told without an env
+    vector = found.vector_space if obs_type == "state" else None
+    space = module.named_space(found.observation_space, vector, found.agent_size, "front")
+    assert space == env.single_observation_space and found.action_space == env.single_action_space
     assert env.call("_max_episode_steps") == (2, 2) and env.get_attr("task")[0] == "softmode/LiftSoft-v0"
     assert "hold it at a goal" in env.call("task_description")[0]
     observation, _ = env.reset(seed=[3, 4], options={module.NEW_ROLLOUT: True})

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+from softmode.checks import require_number
 from softmode.cli.common import (
     BuildBar,
     bar_interval,
@@ -23,6 +24,9 @@ from softmode.learning.config_values import with_config
 from softmode.learning.players import check_policy, policy_factory, trained_policy
 
 if TYPE_CHECKING:
+    import gymnasium as gym
+
+    from softmode.demonstrations.recording import Recorded
     from softmode.demonstrations.writer import DatasetWriter
 
 
@@ -63,6 +67,11 @@ class Record:
     """License that the dataset's card names, such as apache-2.0; your own object may have one of its own."""
     append: bool = False
     """Add to the dataset in the folder, if there is one."""
+    ray: str | None = None
+    """Record on the machines of a Ray cluster: HOST:PORT of its head, auto, or local to use this machine's cores. The
+    same command goes on where it was interrupted."""
+    ray_shard: int = 20
+    """Episodes that a worker records at a time; the dataset does not depend on it."""
     device: str | None = None
     """Warp device, for example cpu or cuda:0."""
     arm: Annotated[RobotOptions, own_group()] = dataclasses.field(default_factory=RobotOptions)
@@ -77,14 +86,17 @@ class Record:
         out = Path("out", short_name) if self.out is None else self.out
         if not self.append and out.exists() and (not out.is_dir() or any(out.iterdir())):
             raise ConfigError(f"{out} exists", hint="choose another folder, or give --append")
+        if self.ray is not None and self.append:
+            raise ConfigError("--ray and --append are given", hint="record on the cluster into another folder")
 
         import gymnasium as gym
         from tqdm import tqdm
 
         from softmode.demonstrations.recording import check_recording, environment_features, record_episodes
-        from softmode.demonstrations.writer import DatasetWriter
+        from softmode.demonstrations.writer import EPISODES_PER_FILE, DatasetWriter
 
         check_recording(self.episodes, self.seed, self.noise)
+        require_number("ray-shard", self.ray_shard, at_least=1, at_most=EPISODES_PER_FILE, hint="give a count like 20")
         trained = trained_policy(self.policy, self.env)
         given: dict[str, Any] = {"obs_type": "pixels_agent_pos"} if trained is None else dict(trained.env_options)
         if self.obs_type is not None:
@@ -102,6 +114,9 @@ class Record:
             origin |= {} if self.license is None else {"license": self.license}
             fps = int(env.metadata["render_fps"])
             robot = ROBOT if self.arm.robot is None else Path(self.arm.robot).stem
+            how = {name: getattr(self, name) for name in ("episodes", "seed", "noise", "only_successes", "states")}
+            if self.ray is not None:
+                return self._on_ray(env, out, origin, how | {"robot": robot, "env_options": given})
             with (
                 DatasetWriter(out, features, fps=fps, robot_type=robot, append=self.append, origin=origin) as writer,
                 tqdm(total=self.episodes, desc="recording", unit="episode", mininterval=bar_interval()) as bar,
@@ -116,9 +131,6 @@ class Record:
                     bar.update(recorded - bar.n)
 
                 try:
-                    how = {
-                        name: getattr(self, name) for name in ("episodes", "seed", "noise", "only_successes", "states")
-                    }
                     result = record_episodes(env, policy, writer, task=purpose(self.env), progress=tell, **how)
                 except KeyboardInterrupt:
                     bar.close()
@@ -126,11 +138,31 @@ class Record:
                     return 130
         finally:
             env.close()
-        print(
-            f"{result.successes} of {result.episodes} recorded episodes succeeded, {result.attempts} were played; "
-            f"{out} holds {writer.episode_count} episodes"
-        )
-        return 0
+        return _tell(result, out, writer.episode_count)
+
+    def _on_ray(self, env: gym.Env, out: Path, origin: dict[str, Any], how: dict[str, Any]) -> int:
+        """Record on a cluster; return the exit code."""
+        from softmode.cli import on_ray
+
+        given = {"env": self.env, "pictures": self.pictures, "device": self.device or "cpu", "shard": self.ray_shard}
+        job = on_ray.job_of(self.policy, **how, **given, task=purpose(self.env), owner=on_ray.owner_of(env))
+        env.close()
+        try:
+            result = on_ray.record_on_ray(str(self.ray), job, out, origin)
+        except KeyboardInterrupt:
+            where = on_ray.folder_of(out)
+            print(f"softmode: interrupted; the same command goes on from what is in {where}", file=sys.stderr)
+            return 130
+        return _tell(result, out, result.episodes)
+
+
+def _tell(result: Recorded, out: Path, count: int) -> int:
+    """Say what was recorded; return the exit code."""
+    print(
+        f"{result.successes} of {result.episodes} recorded episodes succeeded, {result.attempts} were played; "
+        f"{out} holds {count} episodes"
+    )
+    return 0
 
 
 def _tell_interrupted(writer: DatasetWriter, missing: int, seed: int) -> None:

@@ -20,7 +20,7 @@ from softmode.cli.common import (
 )
 from softmode.cli.object_options import ObjectOptions
 from softmode.cli.robot_options import RobotOptions
-from softmode.envs.catalogue import is_soft
+from softmode.envs.catalogue import is_soft, registered_id
 from softmode.errors import ConfigError
 from softmode.learning.players import require_torch
 from softmode.learning.run_folder import checkpoint_in
@@ -121,6 +121,14 @@ class Evaluate:
     """Largest principal strain of a safe success; as in the policy's run, or 0.3."""
     force_limit: float | None = None
     """Largest contact force of a safe success [N]; as in the policy's run, or 15, or thrice what holds the weight."""
+    over: tuple[str, ...] = ()
+    """Keyword arguments of the environment to go through, as NAME=[VALUES], for example yaw_range=[0.5,3.0]; of several
+    all combinations."""
+    ray: str | None = None
+    """Play on the machines of a Ray cluster, each episode from a seed of its own: HOST:PORT of its head, auto, or local
+    to use this machine's cores."""
+    out: Annotated[Path | None, short_name("-o")] = None
+    """With --ray: name of the folder for parts of the work, out/evaluate-ENV if omitted; removed when all is done."""
     arm: Annotated[RobotOptions, own_group()] = dataclasses.field(default_factory=RobotOptions)
     """Another robot in place of the built-in arm."""
     toy: Annotated[ObjectOptions, own_group()] = dataclasses.field(default_factory=ObjectOptions)
@@ -129,25 +137,37 @@ class Evaluate:
     def run(self) -> int:
         """Evaluate; return the exit code."""
         require_torch()
+        from softmode.cli import on_ray
         from softmode.learning.distributed import local_device
         from softmode.learning.environments import make_vector_env
         from softmode.learning.policy import evaluate, load_policy
 
         require_number("num_envs", self.num_envs, at_least=1, hint="give a count like 16")
+        require_number("episodes", self.episodes, at_least=1, hint="give a count like 200")
         policy = load_policy(checkpoint_in(self.policy, self.checkpoint), self.device)
         options = {**policy.env_options, **parse_env_options(self.env_options, self.obs_type)}
         options = self.toy.env_options(self.env, options) | self.arm.env_options()
         limits = {"strain_limit": self.strain_limit, "force_limit": self.force_limit}
         options |= {name: limit for name, limit in limits.items() if limit is not None}
+        over = parse_overrides(self.over)
+        if self.ray is not None:
+            job = {name: getattr(self, name) for name in ("env", "device", "episodes", "num_envs", "seed")}
+            job = on_ray.job_of(checkpoint_in(self.policy, self.checkpoint), **job, env_options=options, over=over)
+            out = self.out or Path("out", f"evaluate-{registered_id(self.env).rpartition('/')[2]}")
+            for chosen, found in on_ray.evaluate_on_ray(self.ray, job, out):
+                print(*(f"{name}={value}" for name, value in chosen.items()), found)
+            return 0
         device = local_device(self.device)
         with quiet_warp():
-            env = make_vector_env(self.env, self.num_envs, device, options)
-            warn_of_env(env)
-            try:
-                policy.check(env)
-                print(evaluate(env, policy, self.episodes, seed=self.seed, device=device))
-            finally:
-                env.close()
+            for chosen in on_ray.combinations(over):
+                env = make_vector_env(self.env, self.num_envs, device, {**options, **chosen})
+                warn_of_env(env)
+                try:
+                    policy.check(env)
+                    found = evaluate(env, policy, self.episodes, seed=self.seed, device=device)
+                    print(*(f"{name}={value}" for name, value in chosen.items()), found)
+                finally:
+                    env.close()
         return 0
 
 

@@ -137,6 +137,7 @@ def record_episodes(
     noise: float = 0.0,
     only_successes: bool = False,
     states: bool = False,
+    seeds: int | None = None,
     progress: Callable[[int, bool, int], None] | None = None,
 ) -> Recorded:
     """Play episodes and record them.
@@ -157,6 +158,7 @@ def record_episodes(
         only_successes: Record only episodes that end in success.
         states: Record the state in which each episode begins as well, of an environment of softmode's; see
             `Dataset.state`.
+        seeds: Play no more seeds than these, and take what they bring; :data:`ATTEMPTS` per episode if None.
         progress: Told after every episode played its seed, whether it succeeded, and how many are recorded.
 
     Raises:
@@ -168,7 +170,7 @@ def record_episodes(
     if states and not hasattr(base, "get_state"):
         raise ConfigError(f"{base} has no get_state", hint="record without states")
     recorded = successes = attempts = 0
-    while recorded < episodes:
+    while recorded < episodes and (seeds is None or attempts < seeds):
         if attempts >= ATTEMPTS * episodes:
             raise ConfigError(
                 f"only {recorded} of {attempts} episodes succeeded, {episodes} were asked for; they are recorded",

@@ -60,9 +60,10 @@ class PictureStatistics:
             "max": level[255 - (self._counts[:, ::-1] > 0).argmax(axis=1)],
             "mean": mean,
             "std": np.sqrt(variance),
+            "count": np.array([self._pictures]),
             **{name: level[(below >= q * total[:, None]).argmax(axis=1)] for name, q in QUANTILES.items()},
         }
-        return {name: value.reshape(3, 1, 1) for name, value in found.items()} | {"count": np.array([self._pictures])}
+        return {name: value if name == "count" else value.reshape(3, 1, 1) for name, value in found.items()}
 
 
 def combine(parts: Sequence[Statistics]) -> Statistics:

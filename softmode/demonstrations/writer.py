@@ -6,13 +6,15 @@ import os
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from softmode.demonstrations import schema
 from softmode.demonstrations.episode import Episode
 from softmode.demonstrations.metadata import Metadata, file_of, read_metadata
 from softmode.demonstrations.schema import INDEX_FEATURES, Feature, write_json, write_table
-from softmode.demonstrations.statistics import Statistics, combine
+from softmode.demonstrations.statistics import Statistics, combine, number_statistics
 from softmode.errors import ConfigError
 from softmode.files import storage_errors, sync
 from softmode.leftovers import Claim, lock
@@ -20,6 +22,16 @@ from softmode.leftovers import Claim, lock
 STAGE = ".recording"
 """Folder inside a dataset where files of an unfinished episode are written."""
 EPISODES_PER_FILE = 500
+
+
+class _Part(NamedTuple):
+    """An episode that goes into the dataset."""
+
+    task: str
+    table: Any
+    statistics: dict[str, Statistics]
+    films: dict[str, Path]
+    state: bytes | None
 
 
 class DatasetWriter:
@@ -129,12 +141,7 @@ class DatasetWriter:
     def _continue(self) -> None:
         """Read the state of the dataset that is there."""
         found: Metadata = read_metadata(self.folder)
-        if found.features != self.features or found.fps != self._fps:
-            raise ConfigError(
-                f"{self.folder} holds features {_described(found.features)} at {found.fps} frames per second, not "
-                f"{_described(self.features)} at {self._fps}",
-                hint="record into another folder",
-            )
+        self._check_same(found, self.folder)
         self._tasks = {task: number for number, task in enumerate(found.tasks)}
         self.episode_count, self.frame_count = found.episode_count, found.frame_count
         self._robot_type, self._origins = found.robot_type, list(found.origins)
@@ -142,9 +149,7 @@ class DatasetWriter:
             return
         self._statistics = found.combined()
         last = found.rows[-1]
-        file = file_of(last, "data")
-        if file_of(last, "meta/episodes") != file or not (table := found.data_table(last)).schema.equals(self._schema):
-            raise ConfigError(f"{self.folder} was written by another program", hint="record into another folder")
+        file, table = file_of(last, "data"), self._own_table(found, last)
         self._file = file["chunk_index"] * schema.CHUNK_SIZE + file["file_index"]
         if any(last.get(f"videos/{name}/file_index") is not None for name in self.features):
             self._films_done = self.episode_count - 1
@@ -152,6 +157,22 @@ class DatasetWriter:
         first = self._rows[0]["dataset_from_index"]
         # What a killed recording left behind the last episode is not taken over.
         self._tables = [table.slice(row["dataset_from_index"] - first, row["length"]) for row in self._rows]
+
+    def _check_same(self, found: Metadata, folder: Path) -> None:
+        """Refuse a dataset with other features or another frame rate."""
+        if found.features != self.features or found.fps != self._fps:
+            raise ConfigError(
+                f"{folder} holds features {_described(found.features)} at {found.fps} frames per second, not "
+                f"{_described(self.features)} at {self._fps}",
+                hint="record into another folder",
+            )
+
+    def _own_table(self, found: Metadata, row: Mapping[str, Any]) -> Any:
+        """Return the table with an episode's frames; refuse one that no writer of this kind has written."""
+        table = found.data_table(row)
+        if file_of(row, "meta/episodes") != file_of(row, "data") or not table.schema.equals(self._schema):
+            raise ConfigError(f"{found.folder} was written by another program", hint="record into another folder")
+        return table
 
     # -- frames -------------------------------------------------------------------------------------------------------
 
@@ -221,50 +242,105 @@ class DatasetWriter:
         self._begin()
         return self.episode_count - 1
 
+    def take_dataset(self, folder: Path, count: int | None = None) -> None:
+        """Add the episodes of a dataset that another writer has written, as if they had been recorded here.
+
+        Its films are moved, so that nothing of it can be used afterwards. Files are in place, but a power failure may
+        lose them until the caller has called ``os.sync``: many datasets need one such call.
+
+        Args:
+            folder: The dataset, on the same file system.
+            count: How many of its episodes, the first ones; all if None.
+
+        Raises:
+            AssetError: If it is damaged.
+            ConfigError: If it has other features.
+            StorageError: If the files cannot be written; the dataset is what it was before.
+        """
+        self._check_open()
+        found = read_metadata(folder)
+        self._check_same(found, folder)
+        pa, tasks, tables, parts = schema.arrow(), dict(self._tasks), {}, []
+        start, end = self.frame_count, 0
+        for row, known in list(zip(found.rows, found.statistics, strict=True))[:count]:
+            where = str(file_of(row, "data"))
+            if where not in tables:
+                tables[where] = self._own_table(found, row), row["dataset_from_index"]
+            whole, first = tables[where]
+            number, length = self.episode_count + len(parts), row["length"]
+            task = tasks.setdefault(row["tasks"][0], len(tasks))
+            numbers = {"index": start + end + np.arange(length)}
+            numbers |= {n: np.full(length, k) for n, k in (("episode_index", number), ("task_index", task))}
+            kept = whole.slice(row["dataset_from_index"] - first, length)
+            columns = [pa.array(numbers[name]) if name in numbers else kept[name] for name in self._schema.names]
+            table = pa.table(columns, schema=self._schema)
+            films = {
+                name: folder / schema.VIDEO_PATH.format(video_key=name, **file_of(row, f"videos/{name}"))
+                for name, kind in self.features.items()
+                if kind.dtype == "video"
+            }
+            state = folder / schema.STATE_PATH.format(number=row["episode_index"])
+            known = known | {name: number_statistics(values[:, None]) for name, values in numbers.items()}
+            parts.append(_Part(row["tasks"][0], table, known, films, state.read_bytes() if state.exists() else None))
+            end += length
+        with storage_errors(f"dataset {self.folder}", hint="free some space"):
+            self._put(parts, durable=False)
+
     def _save(self, task: str, state: bytes | None) -> None:
-        """Stage the files of the dataset with the present episode, then put them in place."""
-        episode, number, start = self._episode, self.episode_count, self.frame_count
-        count = episode.length
-        tasks = {**self._tasks}
-        tasks.setdefault(task, len(tasks))
+        """Add the present episode."""
+        episode = self._episode
         for film in episode.films.values():
             film.close()
-        arrays = episode.arrays(number, start, tasks[task])
-        table, found = episode.table(arrays, self._schema), episode.statistics(arrays)
-        total = {n: combine([self._statistics[n], s]) if n in self._statistics else s for n, s in found.items()}
+        arrays = episode.arrays(self.episode_count, self.frame_count, self._tasks.get(task, len(self._tasks)))
+        table, films = episode.table(arrays, self._schema), {name: film.path for name, film in episode.films.items()}
+        self._put([_Part(task, table, episode.statistics(arrays), films, state)])
 
-        rows, tables, file = self._rows, self._tables, self._file
-        size = sum(part.nbytes for part in tables)
-        if rows and (size + table.nbytes > self._limit or len(rows) >= EPISODES_PER_FILE):
-            rows, tables, file = [], [], file + 1
-        film_number = self._films_done + 1
-        row = self._row(number, task, start, count, file, film_number, found)
-        rows, tables = [*rows, row], [*tables, table]
-
+    def _put(self, parts: list[_Part], *, durable: bool = True) -> None:
+        """Stage the files of the dataset with further episodes, then put them in place."""
         stage = self._root / STAGE
         stage.mkdir(exist_ok=True)
-        where, films = schema.place_of(file), schema.place_of(film_number)
-        moves = {schema.VIDEO_PATH.format(video_key=k, **films): film.path for k, film in episode.films.items()}
-        moves[schema.DATA_PATH.format(**where)] = write_table(stage / "data.parquet", tables)
+        tasks, total = dict(self._tasks), dict(self._statistics)
+        rows, tables, file, film = self._rows, self._tables, self._file, self._films_done
+        number, start = self.episode_count, self.frame_count
+        moves: dict[str, Path] = {}
+        files: dict[int, tuple[list[dict[str, Any]], list[Any]]] = {}
+        for part in parts:
+            tasks.setdefault(part.task, len(tasks))
+            for name, known in part.statistics.items():
+                total[name] = combine([total[name], known]) if name in total else known
+            size = sum(table.nbytes for table in tables)
+            if rows and (size + part.table.nbytes > self._limit or len(rows) >= EPISODES_PER_FILE):
+                rows, tables, file = [], [], file + 1
+            film += 1
+            rows, tables = [*rows, self._row(number, part, start, file, film)], [*tables, part.table]
+            files[file] = rows, tables
+            films = schema.place_of(film)
+            moves |= {schema.VIDEO_PATH.format(video_key=k, **films): path for k, path in part.films.items()}
+            target = schema.STATE_PATH.format(number=number)
+            if part.state is not None:
+                moves[target] = stage / f"state-{number}.npz"
+                moves[target].write_bytes(part.state)
+            else:  # one that a killed recording may have left behind
+                (self._root / target).unlink(missing_ok=True)
+            number, start = number + 1, start + part.table.num_rows
+        for k, (listed, written) in files.items():
+            where = schema.place_of(k)
+            moves[schema.DATA_PATH.format(**where)] = write_table(stage / f"data-{k}.parquet", written)
+            rows_table = schema.rows_table(listed)
+            moves[schema.EPISODES_PATH.format(**where)] = write_table(stage / f"episodes-{k}.parquet", [rows_table])
         if len(tasks) > len(self._tasks):
             moves[schema.TASKS_PATH] = write_table(stage / "tasks.parquet", [schema.tasks_table(tasks)])
-        moves[schema.EPISODES_PATH.format(**where)] = write_table(stage / "episodes.parquet", [schema.rows_table(rows)])
         moves[schema.STATISTICS_PATH] = write_json(stage / "stats.json", schema.listed(total))
         origins, last = self._origins, dict(self._origins[-1]) if self._origins else {}
         last.pop("first_episode", None)
         if self._origin is not None and self._origin != last:
-            origins = [*origins, {**self._origin, "first_episode": number}]
+            origins = [*origins, {**self._origin, "first_episode": self.episode_count}]
             moves[schema.ORIGINS_PATH] = write_json(stage / "softmode.json", {"origins": origins})
-        if state is not None:
-            moves[schema.STATE_PATH.format(number=number)] = stage / "state.npz"
-            (stage / "state.npz").write_bytes(state)
-        else:  # one that a killed recording may have left behind
-            (self._root / schema.STATE_PATH.format(number=number)).unlink(missing_ok=True)
-        info = self._info(number + 1, start + count, tasks)
+        info = self._info(number, start, tasks)
         moves[schema.CARD_PATH] = stage / "README.md"
         moves[schema.CARD_PATH].write_text(schema.card(info, list(tasks), origins[-1] if origins else {}), "utf-8")
         moves[schema.INFO_PATH] = write_json(stage / "info.json", info)
-        for source in moves.values():
+        for source in moves.values() if durable else ():
             sync(source)
         for target, source in moves.items():
             (self._root / target).parent.mkdir(parents=True, exist_ok=True)
@@ -274,22 +350,20 @@ class DatasetWriter:
             os.rename(self._root, self.folder)  # replaces an empty folder, and fails on any other
             self._root, self._is_new = self.folder, False
             self._drop_claim()
-        self._rows, self._tables, self._file = rows, tables, file
+        self._rows, self._tables, self._file, self._films_done = rows, tables, file, film
         self._tasks, self._statistics, self._origins = tasks, total, origins
-        self.episode_count, self.frame_count = number + 1, start + count
-        self._films_done = film_number
+        self.episode_count, self.frame_count = number, start
 
-    def _row(
-        self, number: int, task: str, start: int, count: int, file: int, film: int, found: Mapping[str, Statistics]
-    ) -> dict[str, Any]:
+    def _row(self, number: int, part: _Part, start: int, file: int, film: int) -> dict[str, Any]:
         """Return the row of an episode."""
-        row: dict[str, Any] = {"episode_index": number, "tasks": [task], "length": count}
+        count = part.table.num_rows
+        row: dict[str, Any] = {"episode_index": number, "tasks": [part.task], "length": count}
         row |= {f"data/{key}": value for key, value in schema.place_of(file).items()}
         row |= {"dataset_from_index": start, "dataset_to_index": start + count}
-        for name in self._episode.films:
+        for name in part.films:
             row |= {f"videos/{name}/{key}": value for key, value in schema.place_of(film).items()}
             row |= {f"videos/{name}/from_timestamp": 0.0, f"videos/{name}/to_timestamp": count / self._fps}
-        for name, values in found.items():
+        for name, values in part.statistics.items():
             row |= {f"stats/{name}/{key}": value.tolist() for key, value in values.items()}
         return row | {f"meta/episodes/{key}": value for key, value in schema.place_of(file).items()}
 

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from softmode.envs.scripted import scripted_worlds as scripted_worlds
     from softmode.envs.soft_env import SoftEnv as SoftEnv
     from softmode.envs.soft_vector_env import SoftVectorEnv as SoftVectorEnv
+    from softmode.envs.spec import env_spec as env_spec
     from softmode.envs.task import Task as Task
     from softmode.envs.task_config import TaskConfig as TaskConfig
     from softmode.envs.tasks.lift_soft.task import LiftSoft as LiftSoft

@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 import warp as wp
 
+from softmode.errors import ConfigError
 from softmode.scenes.table_scene import TableScene
 from softmode.splats.cameras.camera import Output
 
@@ -58,14 +59,27 @@ class Pictures:
 
     def spaces(self) -> dict[str, gym.Space]:
         """Return the spaces of the pictures of one world by key."""
-        edge, spaces = self._edge, {}
-        for name in self.images:
-            assert edge is not None
-            if name == "pixels":
-                spaces[name] = gym.spaces.Box(0, 255, (edge, edge, 3), np.uint8)
-            elif name == "depth":
-                spaces[name] = gym.spaces.Box(0.0, 10.0, (edge, edge), np.float32)
-            else:
-                count = len(self._scene.cameras[edge, edge].labels)
-                spaces[name] = gym.spaces.Box(-1, count, (edge, edge), np.int32)
-        return spaces
+        if (edge := self._edge) is None:
+            return {}
+        labels = self._scene.cameras[edge, edge].labels
+        return {name: picture_space(name, edge, len(labels)) for name in self.images}
+
+
+def picture_space(name: str, edge: int, label_count: int | None = None) -> gym.Space:
+    """Return the space of a picture of one world.
+
+    Args:
+        name: pixels, depth or segmentation.
+        edge: Its edge [px].
+        label_count: How many labels a segmentation has.
+
+    Raises:
+        ConfigError: If it is a segmentation and the number is not given.
+    """
+    if name == "pixels":
+        return gym.spaces.Box(0, 255, (edge, edge, 3), np.uint8)
+    if name == "depth":
+        return gym.spaces.Box(0.0, 10.0, (edge, edge), np.float32)
+    if label_count is None:
+        raise ConfigError("the labels of a segmentation are those of a scene", hint="make the environment")
+    return gym.spaces.Box(-1, label_count, (edge, edge), np.int32)

@@ -171,7 +171,7 @@ class Task:
             self.points = self.points_of_choices[held.rows[0]]
             heights = np.array([thing.height for thing in held.choices])
             self.rest_height, lowest = held.follow(heights), held.follow(heights - FALL)
-            self.layout = _layout(self)
+            self.layout = layout_of(self)
             self.segments, self.observation = self.layout.segments, self.layout.values
             on = "action_delay" in self.table.parameters
             self.disturbances = Disturbances(scene, self.table, self.layout, limit) if on else None
@@ -469,7 +469,7 @@ class Task:
         self.pictures.draw()
 
 
-def _layout(task: Task) -> ObservationTable:
+def layout_of(task: Task) -> ObservationTable:
     """Return the observation of a task, laid out in its segments."""
     held, given = task.scene.occupancy, task.config.object_set
     code = one_hot_part(given.count, held.slots) if given is not None and task.config.objects_one_hot else ()

@@ -5,9 +5,9 @@ from __future__ import annotations
 import dataclasses
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -182,8 +182,21 @@ class Evaluation:
         return line if self.safe_success_rate is None else f"{line}, safe success {100 * self.safe_success_rate:.1f} %"
 
 
-@torch.no_grad()
-@stage("playing episodes")
+class Outcomes(NamedTuple):
+    """What came of episodes, each of shape (episodes,)."""
+
+    returns: Any
+    """Undiscounted returns."""
+    lengths: Any
+    """Control steps."""
+    seeds: Any
+    """Seeds; -1 where an episode was not the first one of its world."""
+    successes: Any
+    """Whether each ended in success; none where the environment does not tell."""
+    safe: Any
+    """The same within the limits of force and strain."""
+
+
 def evaluate(
     env: gym.Env | gym.vector.VectorEnv,
     policy: Callable[[Any], Any],
@@ -192,7 +205,21 @@ def evaluate(
     seed: int = EVALUATION_SEED,
     device: str | torch.device = "cpu",
 ) -> Evaluation:
-    """Play whole episodes and count.
+    """Play whole episodes and count; arguments and errors are those of :func:`played`."""
+    return summary([played(env, policy, episodes, seed=seed, device=device)])
+
+
+@torch.no_grad()
+@stage("playing episodes")
+def played(
+    env: gym.Env | gym.vector.VectorEnv,
+    policy: Callable[[Any], Any],
+    episodes: int = 200,
+    *,
+    seed: int = EVALUATION_SEED,
+    device: str | torch.device = "cpu",
+) -> Outcomes:
+    """Play whole episodes.
 
     Every world plays its share of the episodes, its first ones, however long the others' are: short episodes are not
     counted more often than long ones, as they would be if the first ``episodes`` to end were taken.
@@ -209,7 +236,7 @@ def evaluate(
     """
     require_number("episodes", episodes, at_least=1, hint="give a count like 200")
     if isinstance(env, gym.vector.VectorEnv):
-        return _evaluate_vector(env, policy, episodes, seed, torch.device(device))
+        return _played_in_worlds(env, policy, episodes, seed, torch.device(device))
     returns, lengths, outcomes = [], [], []
     for k in range(episodes):
         observation, info = env.reset(seed=seed + k)
@@ -221,12 +248,12 @@ def evaluate(
         lengths.append(length)
         outcomes.append((info.get("is_success"), info.get("is_safe_success")))
     known = (np.array(column, float) if None not in column else None for column in zip(*outcomes, strict=True))
-    return _summary(np.array(returns), np.array(lengths), np.arange(seed, seed + episodes), *known)
+    return Outcomes(np.array(returns), np.array(lengths), np.arange(seed, seed + episodes), *known)
 
 
-def _evaluate_vector(
+def _played_in_worlds(
     env: gym.vector.VectorEnv, policy: Callable[[Any], Any], episodes: int, seed: int, device: torch.device
-) -> Evaluation:
+) -> Outcomes:
     worlds = TensorVectorEnv(env, device)
     n = worlds.count
     # The first worlds play one episode more than the last where the number does not divide.
@@ -261,17 +288,14 @@ def _evaluate_vector(
     table = table[table[:, 0] > 0]
     successes, safe = (table[:, 3 + k] if told else None for k, told in enumerate(knows))
     firsts = table[:, 5].astype(np.int64)
-    return _summary(table[:, 1], table[:, 2], np.where(firsts > 0, seed - 1 + firsts, -1), successes, safe)
+    return Outcomes(table[:, 1], table[:, 2], np.where(firsts > 0, seed - 1 + firsts, -1), successes, safe)
 
 
-def _summary(
-    returns: np.ndarray,
-    lengths: np.ndarray,
-    seeds: np.ndarray,
-    successes: np.ndarray | None,
-    safe: np.ndarray | None,
-) -> Evaluation:
-    """Return the figures of episodes; a seed is -1 where it is not that of the episode."""
+def summary(parts: Sequence[Sequence[Any]]) -> Evaluation:
+    """Return the figures of episodes that were played in parts, each the columns of `Outcomes`."""
+    columns = [None if column[0] is None else np.concatenate(column) for column in zip(*parts, strict=True)]
+    returns, lengths, seeds, successes, safe = columns
+    assert returns is not None and lengths is not None and seeds is not None
     failed = () if successes is None else np.sort(seeds[(successes == 0.0) & (seeds >= 0)]).tolist()
     return Evaluation(
         failed_seeds=tuple(failed),

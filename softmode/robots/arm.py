@@ -6,7 +6,7 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import newton
 import numpy as np
@@ -107,6 +107,9 @@ class ArmDescription:
     """Distance between the pads in the home pose [m]."""
     gripper: GripperDescription = field(default_factory=GripperDescription)
     """The gripper at the flange."""
+
+    joint_count: ClassVar[int] = ARM_JOINT_COUNT
+    """Joints between base and tool."""
 
     def __post_init__(self) -> None:
         """Check the ranges, and that the home pose can be reached."""

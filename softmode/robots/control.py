@@ -9,7 +9,7 @@ the command itself must be iterated to convergence, clamped to limits and worksp
 serial chain that is one small kernel.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
@@ -74,6 +74,17 @@ class ArmControlOptions:
             raise ConfigError(f"workspace_lower {lower} is not below workspace_upper {upper}", hint=hint)
 
 
+def action_names(mode: str, joints: Iterable[int]) -> tuple[str, ...]:
+    """Return the names of an action's entries; the last one is the gripper.
+
+    Args:
+        mode: What actions mean, see `ArmControlOptions`.
+        joints: Coordinates of the joints between base and tool.
+    """
+    steps = ("x", "y", "z", "yaw") if mode == "pose_delta" else map("joint.{}".format, joints)
+    return (*steps, "gripper")
+
+
 class Controller:
     """Holds the commanded configuration of one robot in every world and writes the joint targets.
 
@@ -117,8 +128,7 @@ class Controller:
         """Allocate the command of every world and set it to the model's initial coordinates."""
         self.options = options if options is not None else ArmControlOptions()
         self.arm, self.joint_count = arm, len(joints)
-        steps = ("x", "y", "z", "yaw") if self.options.mode == "pose_delta" else map("joint.{}".format, joints)
-        self.action_names = (*steps, "gripper")
+        self.action_names = action_names(self.options.mode, joints)
         """Names of an action's entries; the last one is the gripper, -1 squeezes and +1 opens."""
         self.action_size = len(self.action_names)
         self.world_count = w = max(model.world_count, 1)

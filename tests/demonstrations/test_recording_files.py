@@ -89,6 +89,21 @@ def test_appending_equals_writing_at_once(tmp_path: Path, pictures: str | None):
     assert info == json.loads((tmp_path / "once/meta/info.json").read_text())
 
 
+@pytest.mark.parametrize("pictures", [None, "image", "video"])
+def test_datasets_that_are_taken_over_are_as_if_recorded_here(tmp_path: Path, pictures: str | None):
+    """Episodes of two datasets, of the second one the first, give the bytes of one recorded in one go."""
+    write(tmp_path / "once", LENGTHS, pictures)
+    write(tmp_path / "first", LENGTHS[:2], pictures)
+    write(tmp_path / "second", (LENGTHS[2], 4), pictures, first=2)
+    with DatasetWriter(tmp_path / "taken", features(pictures), fps=FPS, robot_type="arm") as writer:
+        writer.take_dataset(tmp_path / "first")
+        writer.take_dataset(tmp_path / "second", 1)
+        write(tmp_path / "other", (3,), "image" if pictures is None else None)
+        with pytest.raises(ConfigError, match="holds features"):
+            writer.take_dataset(tmp_path / "other")
+    assert snapshot(tmp_path / "taken") == snapshot(tmp_path / "once")
+
+
 def test_discarded_frames_leave_no_trace(tmp_path: Path):
     """Frames before discard_episode, and those never saved, are not in the dataset."""
     with DatasetWriter(tmp_path / "d", features("video"), fps=FPS) as writer:

@@ -1,8 +1,9 @@
-"""Other libraries take the environments as they are: TorchRL and Minari, where they are installed."""
+"""Other libraries take the environments as they are: TorchRL, Minari and RLlib, where they are installed."""
 
 from __future__ import annotations
 
 import gymnasium as gym
+import numpy as np
 import pytest
 
 from tests.needs import needs
@@ -37,3 +38,26 @@ def test_minari_collects_and_makes_the_environment_again(tmp_path, monkeypatch: 
     made = env.create_dataset("soft/push-v0")
     assert made.total_steps == 3 and made.recover_environment().spec.id == ENV_ID
     env.close()
+
+
+@needs("ray", "tree", "torch")
+def test_rllib_trains_an_iteration(monkeypatch: pytest.MonkeyPatch) -> None:
+    """PPO of RLlib takes two worlds of its own making and learns from one batch of theirs."""
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    import ray
+    from ray.rllib.algorithms.ppo import PPOConfig
+    from ray.tune.registry import register_env
+
+    ray.init(num_cpus=1, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
+    register_env("push", lambda options: gym.make(ENV_ID, **options))
+    config = PPOConfig().environment("push", env_config={"max_episode_steps": 8, "device": "cpu"})
+    config = config.env_runners(num_env_runners=0, num_envs_per_env_runner=2, rollout_fragment_length=16)
+    config = config.training(train_batch_size_per_learner=32, minibatch_size=16, num_epochs=1)
+    algorithm = config.build_algo()
+    try:
+        result = algorithm.train()
+        assert result["env_runners"]["num_env_steps_sampled"] >= 32 and result["env_runners"]["num_episodes"] >= 2
+        assert np.isfinite(result["learners"]["default_policy"]["total_loss"])
+    finally:
+        algorithm.stop()
+        ray.shutdown()

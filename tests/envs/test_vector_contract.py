@@ -22,6 +22,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 
 import softmode
 from softmode.envs import check_vector_env
+from softmode.envs.spec import env_spec
 from softmode.envs.tasks.lift_soft.task import LiftSoftEnv
 from softmode.vector_check import RULES, VALUES
 from softmode.vector_check.values import as_numpy, equal
@@ -102,8 +103,11 @@ def test_spec_and_pickle(make_env: MakeEnv, task: str) -> None:
     spec = gym.spec(task)
     assert spec.entry_point and spec.vector_entry_point and spec.max_episode_steps
     assert not spec.additional_wrappers and not spec.nondeterministic
-    pickled = pickle.dumps(make_env(name_of(task)).unwrapped)
-    assert len(pickled) < 20_000
+    env = make_env(name_of(task)).unwrapped
+    assert len(pickle.dumps(env)) < 20_000
+    told = env_spec(task, config=env.config)  # ... and without being made it is known what it observes
+    assert (told.observation_space, told.action_space) == (env.observation_space, env.action_space)
+    assert (told.agent_size, told.fps) == (env.task.layout.agent_size, env.metadata["render_fps"])
 
 
 # -- vector -----------------------------------------------------------------------------------------------------------

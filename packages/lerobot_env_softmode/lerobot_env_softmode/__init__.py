@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib.metadata import version
 from typing import Any
 
 import gymnasium as gym
+
+from lerobot_env_softmode.worlds import SoftmodeWorlds, check_version, make_worlds, named_space
+from softmode.envs import env_spec
+
+check_version(version("lerobot"))  # before its names are imported, which move
+# ruff: noqa: E402
+
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
-
-from lerobot_env_softmode.worlds import SoftmodeWorlds, make_worlds
 
 __all__ = ["SoftmodeEnv", "SoftmodeWorlds", "make_worlds"]
 
@@ -61,15 +67,15 @@ class SoftmodeEnv(EnvConfig):
         return given
 
     def __post_init__(self) -> None:
-        """Tell LeRobot what is observed: the environment says it, since that depends on task, robot and object."""
-        worlds = self._make(1)
-        try:
-            space = worlds.single_observation_space
-            self.features[ACTION] = PolicyFeature(FeatureType.ACTION, worlds.single_action_space.shape)
-            self.features_map[ACTION] = ACTION
-            self.fps = worlds.metadata["render_fps"]
-        finally:
-            worlds.close()
+        """Tell LeRobot what is observed, which depends on task, robot and object; nothing is built for it."""
+        found = env_spec(
+            self.gym_id, **({} if self.obs_type == "state" else {"camera": self.camera}), **self.gym_kwargs
+        )
+        vector = found.vector_space if self.obs_type == "state" else None
+        space = named_space(found.observation_space, vector, found.agent_size, self.camera)
+        self.features[ACTION] = PolicyFeature(FeatureType.ACTION, found.action_space.shape)
+        self.features_map[ACTION] = ACTION
+        self.fps = found.fps
         kinds = {
             "agent_pos": (FeatureType.STATE, OBS_STATE),
             "environment_state": (FeatureType.ENV, OBS_ENV_STATE),

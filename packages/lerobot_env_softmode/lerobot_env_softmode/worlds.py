@@ -14,6 +14,15 @@ NEW_ROLLOUT = "lerobot_new_rollout"
 """Reset option by which LeRobot marks the first episodes of a rollout."""
 
 
+def check_version(found: str) -> None:
+    """Raise MissingExtraError for a version of LeRobot that this package was not made for."""
+    from softmode.errors import MissingExtraError
+
+    if found.split(".")[:2] != ["0", "6"] or found == "0.6.0":
+        hint = "install it with: pip install 'lerobot>=0.6.1,<0.7'"
+        raise MissingExtraError(f"LeRobot {found} is installed, and this package is for 0.6.1 up to 0.7", hint=hint)
+
+
 def make_worlds(env_id: str, count: int, *, camera: str, **options: Any) -> SoftmodeWorlds:
     """Make a task's vector environment for LeRobot.
 
@@ -32,6 +41,26 @@ def make_worlds(env_id: str, count: int, *, camera: str, **options: Any) -> Soft
         options["camera"] = camera
     mode = AutoresetMode.SAME_STEP
     return SoftmodeWorlds(gym.make_vec(env_id, count, render_mode="rgb_array", autoreset_mode=mode, **options), camera)
+
+
+def named_space(space: gym.Space, vector: gym.spaces.Box | None, agent_size: int, camera: str) -> gym.spaces.Dict:
+    """Return the space of one world's observation by LeRobot's names.
+
+    Args:
+        space: Space of the environment's own observation.
+        vector: Space of the state, where that is observed; None for pictures.
+        agent_size: How many of its leading numbers are the robot's.
+        camera: Name of the camera.
+    """
+    if vector is not None:
+        low, high, size = vector.low, vector.high, agent_size
+        return gym.spaces.Dict(
+            agent_pos=gym.spaces.Box(low[:size], high[:size]),
+            environment_state=gym.spaces.Box(low[size:], high[size:]),
+        )
+    pictures = space["pixels"] if isinstance(space, gym.spaces.Dict) else space
+    parts: dict[str, gym.Space] = {"pixels": gym.spaces.Dict({camera: pictures})}
+    return gym.spaces.Dict(parts | ({"agent_pos": space["agent_pos"]} if isinstance(space, gym.spaces.Dict) else {}))
 
 
 class SoftmodeWorlds(gym.vector.VectorWrapper):
@@ -55,24 +84,13 @@ class SoftmodeWorlds(gym.vector.VectorWrapper):
         self.camera, self.task, self.task_description = camera, env.spec.id, purpose(env.spec.id)
         self._max_episode_steps = self._base.max_episode_steps
         self._state, self._agent_size = self._base.obs_type == "state", self._base.task.layout.agent_size
-        self.single_observation_space = self._space(self._base)
+        layout, space = self._base.task.layout, self._base.single_observation_space
+        vector = layout.space(slice(None)) if self._state else None
+        self.single_observation_space = named_space(space, vector, self._agent_size, camera)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self._ended = np.ones(self.num_envs, bool)
         self._ever = np.zeros(self.num_envs, bool)
         self.episodes, self.last_successes, self.any_successes = 0, 0, 0
-
-    def _space(self, base: Any) -> gym.spaces.Dict:
-        space = base.single_observation_space
-        if self._state:
-            box = base.task.layout.space(slice(None))
-            low, high, size = box.low, box.high, self._agent_size
-            return gym.spaces.Dict(
-                agent_pos=gym.spaces.Box(low[:size], high[:size]),
-                environment_state=gym.spaces.Box(low[size:], high[size:]),
-            )
-        pictures = space["pixels"] if isinstance(space, gym.spaces.Dict) else space
-        parts = {"pixels": gym.spaces.Dict({self.camera: pictures})}
-        return gym.spaces.Dict(parts | ({"agent_pos": space["agent_pos"]} if pictures is not space else {}))
 
     def _view(self, observation: Any) -> dict[str, Any]:
         if self._state:
