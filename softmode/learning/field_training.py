@@ -35,6 +35,7 @@ RATES = (0.1, 0.03, 3.0e-3)
 """Steps of distances [voxels], colours, and logarithms of exposures."""
 EIKONAL, SMOOTH, EVEN = 1.0e-2, 1.0e-3, 1.0e-3
 """Weights of (|grad s| - 1)^2, of the curvature of s and of the differences of colours."""
+HOLLOW = 0.0
 BAND, AGAIN = 4.0, 150
 """Distance from the surface up to which nodes are learned [voxels], and steps after which it is found anew."""
 SLACK, VOTES, CONTRAST = 2, 2, 0.06
@@ -100,12 +101,13 @@ def train_field(
         ray = hit[torch.randint(len(hit), (RAYS,))]
         voxel, of = 2.0 * half / (walls.n - 1), ray // each
         near, far = first[ray] / voxel, last[ray] / voxel
-        color, left = walls.march(eyes[of] / voxel, ways[ray], near, far, min(0.7, 1.2 * beta), beta)
+        color, left, behind = walls.march(eyes[of] / voxel, ways[ray], near, far, min(0.7, 1.2 * beta), beta)
         seen = torch.exp(gain)[of, None] * (color + left[:, None])
         error = ((torch.minimum(seen, 1.0 + 0.01 * (seen - 1.0)) - target[ray]) ** 2).mean()  # cut at white
         for optimiser in (walls.optimiser, exposures):
             optimiser.zero_grad()
-        (error + walls.roughness()).backward()
+        hollow = HOLLOW * (1.0 - part) if size == COARSE else 0.0
+        (error + hollow * behind.mean() / size + walls.roughness()).backward()
         for optimiser in (walls.optimiser, exposures):
             optimiser.step()
         if progress is not None:
@@ -230,8 +232,11 @@ class Walls:
 
     def march(
         self, eye: torch.Tensor, way: torch.Tensor, first: torch.Tensor, last: torch.Tensor, step: float, beta: float
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return colour times coverage (R, 3) and light left (R,) of rays [voxels] between two places each."""
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return colour times coverage (R, 3), light left and way behind what is seen (R,) of rays between two places.
+
+        Lengths are in voxels.
+        """
         ticks = torch.arange(float(((last - first) / step).max()))[None] + torch.rand(len(eye), 1)
         t = first[:, None] + ticks * step
         at = eye[:, None] + t[..., None] * way[:, None]
@@ -258,4 +263,5 @@ class Walls:
         share = (light * (1.0 - torch.exp(-tau))).reshape(-1)[use]
         color = 0.5 + SH_DC * (self.c.index_select(0, rows.reshape(-1)).reshape(-1, 8, 3) * weight[..., None]).sum(1)
         color = torch.zeros(len(eye), 3).index_add(0, use // t.shape[1], share[:, None] * color)
-        return color, torch.exp(-tau.sum(1))
+        behind = torch.zeros(len(eye)).index_add(0, use // t.shape[1], share * (last[:, None] - t).reshape(-1)[use])
+        return color, torch.exp(-tau.sum(1)), behind
