@@ -78,8 +78,7 @@ def test_fog():
 
 
 def test_voids_and_parts():
-    """A hollow shell is filled, a floater is left out, and the report says so, and where a faint lid closes the shell.
-    """
+    """A hollow shell is filled, a floater is left out, and the report says so, and where a faint lid closes it."""
 
     def shell(x):
         return (np.abs(np.linalg.norm(x, axis=1) - 0.035) < 0.005) | (np.linalg.norm(x - 0.045, axis=1) < 0.005)
