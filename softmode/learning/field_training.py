@@ -2,7 +2,8 @@
 
 The field is a signed distance s [voxels] at the nodes of a sparse grid, of density Psi(-s / beta) / beta, where Psi is
 the distribution function of Laplace and beta shrinks (VolSDF, Yariv et al. 2021), so that it ends in walls and not in
-fog. It is carved out of the silhouettes first, which takes a backdrop that is known.
+fog. It is carved first: out of the silhouettes, which takes a backdrop that is known, then where pictures disagree on a
+colour (Kutulakos and Seitz 2000), since no gradient empties a cavity whose mouth it takes for a wall.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ with needs_extra("rl", "training a field needs torch"):
 
 Array = NDArray[np.float64]
 
-COARSE, FINE, SWITCH = 48, 96, 0.3
-"""Nodes of an edge at first and at last, and the part of the steps after which the grid is refined."""
+CARVED, COARSE, FINE, SWITCH = 64, 48, 96, 0.3
+"""Nodes of an edge where it is carved, at first and at last, and the part of the steps after which it is refined."""
 RAYS, REGULAR = 4096, 6000
 """Rays and nodes with neighbours of a step."""
 WIDEST, SHARPEST = 1.0, 0.4
@@ -35,9 +36,11 @@ RATES = (0.1, 0.03, 3.0e-3)
 """Steps of distances [voxels], colours, and logarithms of exposures."""
 EIKONAL, SMOOTH, EVEN = 1.0e-2, 1.0e-3, 1.0e-3
 """Weights of (|grad s| - 1)^2, of the curvature of s and of the differences of colours."""
-HOLLOW = 0.0
 BAND, AGAIN = 4.0, 150
 """Distance from the surface up to which nodes are learned [voxels], and steps after which it is found anew."""
+FACING, WINDOW, APART = 0.5, 5, 0.07
+"""Least cosine between the normal of a node and the way to pictures that see it; they disagree where the colours in
+windows of so many pixels are so far apart."""
 SLACK, VOTES, CONTRAST = 2, 2, 0.06
 """Silhouettes are widened by so many pixels; a node that so many see beside one is carved; what differs so much from
 the backdrop stands before it."""
@@ -78,10 +81,15 @@ def train_field(
     border = np.concatenate([images[:, :3].reshape(len(images), -1, 3), images[:, -3:].reshape(len(images), -1, 3)], 1)
     wall = np.median(border, axis=1).astype(np.float64)
     middle, half = _cube(pictures)
-    carved = _hull(pictures, images, wall, middle, half)
+    line = np.linspace(-half, half, CARVED)
+    nodes = np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1) + middle
+    hull = _hull(pictures, images, wall, nodes)
+    carved = _agreed(hull, pictures, images / wall[:, None, None], nodes) if hull.any() else hull
     if not carved.any():
-        raise AssetError("the silhouettes have nothing in common", hint="check poses, lens and that the wall is plain")
-    walls = Walls(_distance(carved), np.zeros((*carved.shape, 3)), inside=True)
+        hint = "check poses, lens, exposure and that the wall is plain"
+        raise AssetError("silhouettes or colours have nothing in common", hint=hint)
+    ratio = COARSE / CARVED
+    walls = Walls(_zoomed(_distance(carved), ratio) * ratio, np.zeros((COARSE,) * 3 + (3,)), inside=True)
     gain = torch.tensor(np.log(wall.mean(axis=1)), dtype=torch.float32, requires_grad=True)
     exposures = torch.optim.Adam([gain], lr=RATES[2])
     eyes = torch.tensor(np.array([p.camera.position for p in pictures]) - middle + half, dtype=torch.float32)
@@ -101,13 +109,12 @@ def train_field(
         ray = hit[torch.randint(len(hit), (RAYS,))]
         voxel, of = 2.0 * half / (walls.n - 1), ray // each
         near, far = first[ray] / voxel, last[ray] / voxel
-        color, left, behind = walls.march(eyes[of] / voxel, ways[ray], near, far, min(0.7, 1.2 * beta), beta)
+        color, left = walls.march(eyes[of] / voxel, ways[ray], near, far, min(0.7, 1.2 * beta), beta)
         seen = torch.exp(gain)[of, None] * (color + left[:, None])
         error = ((torch.minimum(seen, 1.0 + 0.01 * (seen - 1.0)) - target[ray]) ** 2).mean()  # cut at white
         for optimiser in (walls.optimiser, exposures):
             optimiser.zero_grad()
-        hollow = HOLLOW * (1.0 - part) if size == COARSE else 0.0
-        (error + hollow * behind.mean() / size + walls.roughness()).backward()
+        (error + walls.roughness()).backward()
         for optimiser in (walls.optimiser, exposures):
             optimiser.step()
         if progress is not None:
@@ -134,12 +141,10 @@ def _cube(pictures: Sequence[PosedPicture]) -> tuple[Array, float]:
 
 
 def _hull(
-    pictures: Sequence[PosedPicture], images: NDArray[np.float32], wall: Array, middle: Array, half: float
+    pictures: Sequence[PosedPicture], images: NDArray[np.float32], wall: Array, nodes: Array
 ) -> NDArray[np.bool_]:
-    """Return the nodes of the coarse grid that half of the pictures see, and that lie in the silhouettes."""
-    line = np.linspace(-half, half, COARSE)
-    nodes = np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1) + middle
-    beside, seen = np.zeros((COARSE,) * 3, int), np.zeros((COARSE,) * 3, int)
+    """Return the nodes (n, n, n, 3) that half of the pictures see, and that lie in the silhouettes."""
+    beside, seen = np.zeros(nodes.shape[:3], int), np.zeros(nodes.shape[:3], int)
     for picture, image, back in zip(pictures, images, wall, strict=True):
         apart: Any = np.abs(ndimage.gaussian_filter(image, (0.7, 0.7, 0.0)) - back).max(axis=-1) > CONTRAST
         front: Any = ndimage.binary_dilation(ndimage.binary_opening(ndimage.binary_fill_holes(apart)), iterations=SLACK)
@@ -149,6 +154,45 @@ def _hull(
         beside += inside & ~front[i.clip(0, front.shape[0] - 1), j.clip(0, front.shape[1] - 1)]
     hull: Any = ndimage.binary_erosion((beside < VOTES) & (2 * seen >= len(images)))
     return hull
+
+
+def _agreed(
+    full: NDArray[np.bool_], pictures: Sequence[PosedPicture], images: NDArray[np.float32], nodes: Array
+) -> NDArray[np.bool_]:
+    """Return what is left when nodes at the surface go, again and again, whose colour the pictures do not agree on."""
+    count, size, x = len(images), images.shape[1:3], nodes[full]
+    voxel = float(np.linalg.norm(nodes[0, 0, 1] - nodes[0, 0, 0]))
+    pixel = np.floor(np.stack([picture.project(x) for picture in pictures])).astype(int)
+    known = ((pixel >= 0) & (pixel < size[::-1])).all(axis=-1)
+    j, i = np.moveaxis(pixel.clip(0, np.array(size[::-1]) - 1), -1, 0)
+    way = np.array([picture.camera.position for picture in pictures])[:, None] - x
+    depth = np.linalg.norm(way, axis=-1)
+    way /= depth[..., None]
+    cell = int(np.ceil(pictures[0].camera.fx * voxel / depth.mean()))  # pixels of a voxel, so that fronts have no gaps
+    wide, each = size[1] // cell + 1, np.arange(count)[:, None]
+    front = (each * (size[0] // cell + 1) + i // cell) * wide + j // cell
+    where, even = (each * size[0] + i) * size[1] + j, ndimage.gaussian_filter(images, (0.0, 1.0, 1.0, 0.0))
+    window = (1, WINDOW, WINDOW, 1)
+    low, high = (f(even, window).reshape(-1, 3) for f in (ndimage.minimum_filter, ndimage.maximum_filter))
+    row, full = np.cumsum(full.ravel()) - 1, full.copy()
+    while full.any():
+        outer: Any = np.flatnonzero(full & ~ndimage.binary_erosion(full))
+        slope: Any = np.gradient(ndimage.gaussian_filter(full.astype(float), 1.2))
+        normal = -np.stack([part.ravel()[outer] for part in slope], axis=-1)
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+        k = row[outer]
+        near = np.full(front.max() + 1, np.inf)
+        np.minimum.at(near, front[:, k], depth[:, k])
+        seen = known[:, k] & (depth[:, k] < near[front[:, k]] + 1.6 * voxel)
+        seen &= np.einsum("pnd,nd->pn", way[:, k], normal) > FACING
+        some = seen.sum(axis=0) > 3
+        seen, k, outer = seen[:, some, None], k[some], outer[some]
+        most = np.where(seen, low[where[:, k]], -np.inf).max(axis=0)
+        bad = (most - np.where(seen, high[where[:, k]], np.inf).min(axis=0) > APART).any(axis=-1)
+        if not bad.any():
+            break
+        full.ravel()[outer[bad]] = False
+    return full
 
 
 def _distance(full: NDArray[np.bool_]) -> Array:
@@ -232,11 +276,8 @@ class Walls:
 
     def march(
         self, eye: torch.Tensor, way: torch.Tensor, first: torch.Tensor, last: torch.Tensor, step: float, beta: float
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Return colour times coverage (R, 3), light left and way behind what is seen (R,) of rays between two places.
-
-        Lengths are in voxels.
-        """
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return colour times coverage (R, 3) and light left (R,) of rays [voxels] between two places each."""
         ticks = torch.arange(float(((last - first) / step).max()))[None] + torch.rand(len(eye), 1)
         t = first[:, None] + ticks * step
         at = eye[:, None] + t[..., None] * way[:, None]
@@ -263,5 +304,4 @@ class Walls:
         share = (light * (1.0 - torch.exp(-tau))).reshape(-1)[use]
         color = 0.5 + SH_DC * (self.c.index_select(0, rows.reshape(-1)).reshape(-1, 8, 3) * weight[..., None]).sum(1)
         color = torch.zeros(len(eye), 3).index_add(0, use // t.shape[1], share[:, None] * color)
-        behind = torch.zeros(len(eye)).index_add(0, use // t.shape[1], share * (last[:, None] - t).reshape(-1)[use])
-        return color, torch.exp(-tau.sum(1)), behind
+        return color, torch.exp(-tau.sum(1))

@@ -43,7 +43,7 @@ def test_a_ball_is_a_ball(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     """Ten small pictures and coarse grids leave a solid of walls with the ball's volume to a sixth, and its colours."""
     from softmode.learning import train_field
 
-    for name, value in {"COARSE": 24, "FINE": 32, "RAYS": 1024, "REGULAR": 1000}.items():
+    for name, value in {"CARVED": 24, "COARSE": 24, "FINE": 32, "RAYS": 1024, "REGULAR": 1000}.items():
         monkeypatch.setattr(f"softmode.learning.field_training.{name}", value)
     told: list[float] = []
     found = train_field(
