@@ -38,9 +38,9 @@ EIKONAL, SMOOTH, EVEN = 1.0e-2, 1.0e-3, 1.0e-3
 """Weights of (|grad s| - 1)^2, of the curvature of s and of the differences of colours."""
 BAND, AGAIN = 4.0, 150
 """Distance from the surface up to which nodes are learned [voxels], and steps after which it is found anew."""
-FACING, WINDOW, APART = 0.5, 5, 0.07
-"""Least cosine between the normal of a node and the way to pictures that see it; they disagree where the colours in
-windows of so many pixels are so far apart."""
+FACING, APART, COVERED = 0.5, 0.07, 0.9
+"""Least cosine between the normal of a node and the way to pictures that see it; they disagree where the colours around
+it are so far apart. What is left must cover so much of the silhouettes, or the pictures agree on nothing."""
 SLACK, VOTES, CONTRAST = 2, 2, 0.06
 """Silhouettes are widened by so many pixels; a node that so many see beside one is carved; what differs so much from
 the backdrop stands before it."""
@@ -159,7 +159,10 @@ def _hull(
 def _agreed(
     full: NDArray[np.bool_], pictures: Sequence[PosedPicture], images: NDArray[np.float32], nodes: Array
 ) -> NDArray[np.bool_]:
-    """Return what is left when nodes at the surface go, again and again, whose colour the pictures do not agree on."""
+    """Return what is left when nodes at the surface go, again and again, whose colour the pictures do not agree on.
+
+    Where that is too little for the silhouettes, as under highlights and wrong poses, all are left.
+    """
     count, size, x = len(images), images.shape[1:3], nodes[full]
     voxel = float(np.linalg.norm(nodes[0, 0, 1] - nodes[0, 0, 0]))
     pixel = np.floor(np.stack([picture.project(x) for picture in pictures])).astype(int)
@@ -168,13 +171,14 @@ def _agreed(
     way = np.array([picture.camera.position for picture in pictures])[:, None] - x
     depth = np.linalg.norm(way, axis=-1)
     way /= depth[..., None]
-    cell = int(np.ceil(pictures[0].camera.fx * voxel / depth.mean()))  # pixels of a voxel, so that fronts have no gaps
-    wide, each = size[1] // cell + 1, np.arange(count)[:, None]
-    front = (each * (size[0] // cell + 1) + i // cell) * wide + j // cell
+    wide = pictures[0].camera.fx * voxel / depth.mean()  # pixels of a voxel
+    cell, window = int(np.ceil(wide)), 2 * round(wide) + 1
+    each = np.arange(count)[:, None]
+    front = (each * (size[0] // cell + 1) + i // cell) * (size[1] // cell + 1) + j // cell
     where, even = (each * size[0] + i) * size[1] + j, ndimage.gaussian_filter(images, (0.0, 1.0, 1.0, 0.0))
-    window = (1, WINDOW, WINDOW, 1)
-    low, high = (f(even, window).reshape(-1, 3) for f in (ndimage.minimum_filter, ndimage.maximum_filter))
-    row, full = np.cumsum(full.ravel()) - 1, full.copy()
+    filters = (ndimage.minimum_filter, ndimage.maximum_filter)
+    low, high = (of(even, (1, window, window, 1)).reshape(-1, 3) for of in filters)
+    row, hull, full = np.cumsum(full.ravel()) - 1, full, full.copy()
     while full.any():
         outer: Any = np.flatnonzero(full & ~ndimage.binary_erosion(full))
         slope: Any = np.gradient(ndimage.gaussian_filter(full.astype(float), 1.2))
@@ -192,7 +196,8 @@ def _agreed(
         if not bad.any():
             break
         full.ravel()[outer[bad]] = False
-    return full
+    share = len(np.unique(front[:, full[hull]])) / len(np.unique(front))
+    return full if share > COVERED else hull
 
 
 def _distance(full: NDArray[np.bool_]) -> Array:
