@@ -32,8 +32,7 @@ def views(splats, count: int, lowest: float, turn: float, edge: int, fov: float)
     """Return cameras on a spiral around splats, from a height -1..1 up."""
     low, high = splats.bounds()
     middle, distance = 0.5 * (low + high), 1.5 * float(np.linalg.norm(high - low))
-    first, last = np.arcsin([lowest, 0.97])  # steps of elevation, so that more look down into a cavity
-    z = np.sin(first + (last - first) * (np.arange(count) + 0.5) / count)
+    z = lowest + (0.97 - lowest) * (np.arange(count) + 0.5) / count
     a, r = turn + np.arange(count) * np.pi * (3.0 - np.sqrt(5.0)), np.sqrt(1.0 - z * z)
     eyes = middle + distance * np.stack([r * np.cos(a), r * np.sin(a), z], axis=1)
     size = {"target": tuple(middle), "width": edge, "height": edge, "fov_y": fov}

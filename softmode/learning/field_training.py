@@ -2,8 +2,7 @@
 
 The field is a signed distance s [voxels] at the nodes of a sparse grid, of density Psi(-s / beta) / beta, where Psi is
 the distribution function of Laplace and beta shrinks (VolSDF, Yariv et al. 2021), so that it ends in walls and not in
-fog. It is carved first: out of the silhouettes, which takes a backdrop that is known, then where pictures disagree on a
-colour (Kutulakos and Seitz 2000), since no gradient empties a cavity whose mouth it takes for a wall.
+fog. It is carved out of the silhouettes first, which takes a backdrop that is known.
 """
 
 from __future__ import annotations
@@ -26,8 +25,8 @@ with needs_extra("rl", "training a field needs torch"):
 
 Array = NDArray[np.float64]
 
-CARVED, COARSE, FINE, SWITCH = 64, 48, 96, 0.3
-"""Nodes of an edge where it is carved, at first and at last, and the part of the steps after which it is refined."""
+COARSE, FINE, SWITCH = 48, 96, 0.3
+"""Nodes of an edge at first and at last, and the part of the steps after which the grid is refined."""
 RAYS, REGULAR = 4096, 6000
 """Rays and nodes with neighbours of a step."""
 WIDEST, SHARPEST = 1.0, 0.4
@@ -38,9 +37,6 @@ EIKONAL, SMOOTH, EVEN = 1.0e-2, 1.0e-3, 1.0e-3
 """Weights of (|grad s| - 1)^2, of the curvature of s and of the differences of colours."""
 BAND, AGAIN = 4.0, 150
 """Distance from the surface up to which nodes are learned [voxels], and steps after which it is found anew."""
-FACING, APART, COVERED = 0.5, 0.07, 0.9
-"""Least cosine between the normal of a node and the way to pictures that see it; they disagree where the colours around
-it are so far apart. What is left must cover so much of the silhouettes, or the pictures agree on nothing."""
 SLACK, VOTES, CONTRAST = 2, 2, 0.06
 """Silhouettes are widened by so many pixels; a node that so many see beside one is carved; what differs so much from
 the backdrop stands before it."""
@@ -81,15 +77,10 @@ def train_field(
     border = np.concatenate([images[:, :3].reshape(len(images), -1, 3), images[:, -3:].reshape(len(images), -1, 3)], 1)
     wall = np.median(border, axis=1).astype(np.float64)
     middle, half = _cube(pictures)
-    line = np.linspace(-half, half, CARVED)
-    nodes = np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1) + middle
-    hull = _hull(pictures, images, wall, nodes)
-    carved = _agreed(hull, pictures, images / wall[:, None, None], nodes) if hull.any() else hull
+    carved = _hull(pictures, images, wall, middle, half)
     if not carved.any():
-        hint = "check poses, lens, exposure and that the wall is plain"
-        raise AssetError("silhouettes or colours have nothing in common", hint=hint)
-    ratio = COARSE / CARVED
-    walls = Walls(_zoomed(_distance(carved), ratio) * ratio, np.zeros((COARSE,) * 3 + (3,)), inside=True)
+        raise AssetError("the silhouettes have nothing in common", hint="check poses, lens and that the wall is plain")
+    walls = Walls(_distance(carved), np.zeros((*carved.shape, 3)), inside=True)
     gain = torch.tensor(np.log(wall.mean(axis=1)), dtype=torch.float32, requires_grad=True)
     exposures = torch.optim.Adam([gain], lr=RATES[2])
     eyes = torch.tensor(np.array([p.camera.position for p in pictures]) - middle + half, dtype=torch.float32)
@@ -141,10 +132,12 @@ def _cube(pictures: Sequence[PosedPicture]) -> tuple[Array, float]:
 
 
 def _hull(
-    pictures: Sequence[PosedPicture], images: NDArray[np.float32], wall: Array, nodes: Array
+    pictures: Sequence[PosedPicture], images: NDArray[np.float32], wall: Array, middle: Array, half: float
 ) -> NDArray[np.bool_]:
-    """Return the nodes (n, n, n, 3) that half of the pictures see, and that lie in the silhouettes."""
-    beside, seen = np.zeros(nodes.shape[:3], int), np.zeros(nodes.shape[:3], int)
+    """Return the nodes of the coarse grid that half of the pictures see, and that lie in the silhouettes."""
+    line = np.linspace(-half, half, COARSE)
+    nodes = np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1) + middle
+    beside, seen = np.zeros((COARSE,) * 3, int), np.zeros((COARSE,) * 3, int)
     for picture, image, back in zip(pictures, images, wall, strict=True):
         apart: Any = np.abs(ndimage.gaussian_filter(image, (0.7, 0.7, 0.0)) - back).max(axis=-1) > CONTRAST
         front: Any = ndimage.binary_dilation(ndimage.binary_opening(ndimage.binary_fill_holes(apart)), iterations=SLACK)
@@ -154,50 +147,6 @@ def _hull(
         beside += inside & ~front[i.clip(0, front.shape[0] - 1), j.clip(0, front.shape[1] - 1)]
     hull: Any = ndimage.binary_erosion((beside < VOTES) & (2 * seen >= len(images)))
     return hull
-
-
-def _agreed(
-    full: NDArray[np.bool_], pictures: Sequence[PosedPicture], images: NDArray[np.float32], nodes: Array
-) -> NDArray[np.bool_]:
-    """Return what is left when nodes at the surface go, again and again, whose colour the pictures do not agree on.
-
-    Where that is too little for the silhouettes, as under highlights and wrong poses, all are left.
-    """
-    count, size, x = len(images), images.shape[1:3], nodes[full]
-    voxel = float(np.linalg.norm(nodes[0, 0, 1] - nodes[0, 0, 0]))
-    pixel = np.floor(np.stack([picture.project(x) for picture in pictures])).astype(int)
-    known = ((pixel >= 0) & (pixel < size[::-1])).all(axis=-1)
-    j, i = np.moveaxis(pixel.clip(0, np.array(size[::-1]) - 1), -1, 0)
-    way = np.array([picture.camera.position for picture in pictures])[:, None] - x
-    depth = np.linalg.norm(way, axis=-1)
-    way /= depth[..., None]
-    wide = pictures[0].camera.fx * voxel / depth.mean()  # pixels of a voxel
-    cell, window = int(np.ceil(wide)), 2 * round(wide) + 1
-    each = np.arange(count)[:, None]
-    front = (each * (size[0] // cell + 1) + i // cell) * (size[1] // cell + 1) + j // cell
-    where, even = (each * size[0] + i) * size[1] + j, ndimage.gaussian_filter(images, (0.0, 1.0, 1.0, 0.0))
-    filters = (ndimage.minimum_filter, ndimage.maximum_filter)
-    low, high = (of(even, (1, window, window, 1)).reshape(-1, 3) for of in filters)
-    row, hull, full = np.cumsum(full.ravel()) - 1, full, full.copy()
-    while full.any():
-        outer: Any = np.flatnonzero(full & ~ndimage.binary_erosion(full))
-        slope: Any = np.gradient(ndimage.gaussian_filter(full.astype(float), 1.2))
-        normal = -np.stack([part.ravel()[outer] for part in slope], axis=-1)
-        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
-        k = row[outer]
-        near = np.full(front.max() + 1, np.inf)
-        np.minimum.at(near, front[:, k], depth[:, k])
-        seen = known[:, k] & (depth[:, k] < near[front[:, k]] + 1.6 * voxel)
-        seen &= np.einsum("pnd,nd->pn", way[:, k], normal) > FACING
-        some = seen.sum(axis=0) > 3
-        seen, k, outer = seen[:, some, None], k[some], outer[some]
-        most = np.where(seen, low[where[:, k]], -np.inf).max(axis=0)
-        bad = (most - np.where(seen, high[where[:, k]], np.inf).min(axis=0) > APART).any(axis=-1)
-        if not bad.any():
-            break
-        full.ravel()[outer[bad]] = False
-    share = len(np.unique(front[:, full[hull]])) / len(np.unique(front))
-    return full if share > COVERED else hull
 
 
 def _distance(full: NDArray[np.bool_]) -> Array:
