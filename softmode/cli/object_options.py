@@ -27,6 +27,8 @@ class ObjectOptions:
     object: Path | None = None
     """File of any kind: a mesh, a body of `softmode body build`, splats, a radiance field, an OpenUSD stage; or a
     preset's name, see `softmode objects list`."""
+    march: bool = False
+    """March rays through the radiance field of the object in every picture, instead of drawing splats baked of it."""
     size: float | None = None
     """Longest edge [m]; 0.08 if a file is given, a preset has its own."""
     up: Literal["+x", "-x", "+y", "-y", "+z", "-z"] | None = None
@@ -94,6 +96,7 @@ class ObjectOptions:
         """The options that say how a file becomes an object, as fields of `ObjectConfig`."""
         names = ("size", "up", "crop", "part", "pose", "resolution", "stiffness_file", "density_file")
         given = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        given |= {"march": True} if self.march else {}
         if self.stiffness:
             given["stiffness"] = tuple(map(stiffer_box, self.stiffness))
         for what in ("stiffness", "density"):
@@ -126,7 +129,7 @@ class ObjectOptions:
         elif self.object is not None:
             base = object_config(self.object, **like)
         if base.body is not None:
-            self._refuse(given, f"the body {base.body}", "give them to softmode body build")
+            self._refuse({*given} - {"march"}, f"the body {base.body}", "give them to softmode body build")
         elif base.extents is not None:
             self._refuse(
                 set(given) - {*PAINTED},

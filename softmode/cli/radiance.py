@@ -32,7 +32,8 @@ class RadianceInfo:
         density = field.density[field.occupied if field.occupied.any() else field.density > 0.0].astype(float)
         deciles = np.quantile(density, [0.1, 0.5, 0.9])
         solid = quadrature_from_density(field.densities, field.surroundings, surface_count=16)
-        fog, unit = float(solid.report["fog"]), "not known" if field.metres is None else f"{field.metres:.4g} m"
+        fog, filled, opened = (float(solid.report[name]) for name in ("fog", "filled_share", "open_share"))
+        unit = "not known" if field.metres is None else f"{field.metres:.4g} m"
 
         def row(values: object) -> str:
             return "  ".join(f"{value:.4g}" for value in np.ravel(np.asarray(values)))
@@ -46,6 +47,7 @@ class RadianceInfo:
         print(f"densities   {row(deciles)}  per unit of length (10, 50, 90 % of what is not empty)")
         print(f"opacities   {row(-np.expm1(-deciles * field.spacing))}  of a voxel, likewise")
         print(f"solid       {solid.volume:.4g} units of length cubed; half the level of its surface adds {fog:.0%}")
+        print(f"voids       {filled:.0%} of it were filled, {opened:.0%} that only something thin or faint closes")
         if fog > FOGGY:
             print("            this is fog (walls: 0 to 11 %): the solid is doubtful, and cavities may be full")
         return 0

@@ -94,6 +94,8 @@ def _serve(options: View, session: LiveSession, served: ViewOptions) -> bool:
     try:
         with ViewApp(session, served, capture=_is_capture(_file(options))) as app:
             print(f"softmode: open {app.url} in a browser; Ctrl-C ends it", flush=True)
+            if options.toy.march:
+                print("softmode: the page shows splats baked of the field; videos that it records march", flush=True)
             if not served.is_local:
                 print(
                     f"softmode: warning: listening at {options.host}: whoever has that address, which travels "

@@ -53,7 +53,7 @@ def train_field(
     """Train a field on pictures of an object before a white wall.
 
     The exposure of each picture is found too. Colours do not depend on the direction. What no picture shows is filled.
-    A cavity of one even colour, such as the inside of a plain cup, is not told from a lid, and is full.
+    A cavity into which few pictures look, such as the inside of a cup, is not told from a lid, and is full.
 
     Args:
         pictures: The pictures; the border of each is the wall. The object is where their axes meet.

@@ -75,7 +75,9 @@ class ObjectConfig:
     closed stands for what it encloses."""
     radiance: str | Path | RadianceGrid | None = None
     """Radiance field (.npz, Plenoxels, .nvdb, see `read_radiance`), or one that has been read; it is shown by splats
-    baked of it, or marched (`SplatScene(march=True)`)."""
+    baked of it, or marched (`march`)."""
+    march: bool = False
+    """Whether cameras march rays through its field instead of drawing the splats baked of it: sharper and slower."""
     body: str | Path | None = None
     """File of a body (`softmode body build`, `ReducedBody.save`, or a stage with one from `usd.write_usd`): taken as it
     is, with its own size, pose, surface samples, regions and splats."""
@@ -165,6 +167,8 @@ class ObjectConfig:
                 f" {self.radiance!r} and body {self.body!r} exclude each other",
                 hint="give one of them",
             )
+        if self.march and self.radiance is None and self.body is None:
+            raise ConfigError(f"march: a {self.kind} has no radiance field", hint="give a field, or leave it out")
         if self.body is not None and self.clamped_height > 0.0:
             hint = "build it with a region for its foot: softmode body build FILE --region foot=..."
             raise ConfigError(f"clamped_height is {self.clamped_height} m for a body that is built", hint=hint)

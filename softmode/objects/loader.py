@@ -17,6 +17,7 @@ from softmode.deformables.body.regions import Region
 from softmode.deformables.materials.material import Material, warn_of_units
 from softmode.deformables.quadrature.quadrature_grid import Quadrature
 from softmode.deformables.reduction.cache import cached_body
+from softmode.errors import ConfigError
 from softmode.objects.captures import bundled
 from softmode.objects.config import ObjectConfig
 from softmode.objects.object_file import file_kind, read_object, surface_cover
@@ -74,6 +75,9 @@ def load(
     config = object_config(source, **options)
     if config.body is not None:
         found = read_object(config.body)
+        if config.march and found.radiance is None:
+            hint = "build it from a field (softmode body build toy.npz), or leave it out"
+            raise ConfigError(f"march: the body {config.body} has no radiance field", hint=hint)
         return replace(
             found,
             splats=found.splats or surface_cover(found.body),

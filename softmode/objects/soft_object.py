@@ -90,6 +90,11 @@ class SoftObject:
         return found
 
     @property
+    def marched(self) -> RadianceGrid | None:
+        """Its field if cameras are to march through it (`ObjectConfig.march`), else None."""
+        return self.radiance if self.config is not None and self.config.march else None
+
+    @property
     def field_pose(self) -> Array | None:
         """What takes places in the frame of the field's file into the body frame, a scale times a rotation, and a move.
 

@@ -129,6 +129,8 @@ class RadianceMarch:
         if any(grid.sh_degree and not inverse.grid.turn.shape[0] for inverse, grid in fields):
             raise ConfigError("a field has view-dependent colours", hint="make its InverseMap with turns=True")
         self.maps = tuple(inverse for inverse, _ in fields)
+        self.hides: tuple[int, ...] = ()
+        """Bodies whose splats are not drawn: those of `of_bodies`."""
         self.device = self.maps[0].device
         self._fields = [upload_field(grid, self.options.step, self.device) for _, grid in fields]
         self._live = [wp.zeros(inverse.grid.flag.shape, dtype=int, device=self.device) for inverse in self.maps]
@@ -157,8 +159,9 @@ class RadianceMarch:
                        turns=grid.sh_degree > 0)
             for body, grid in fields
         ]  # fmt: skip
-        grids = [grid for _, grid in fields]
-        return cls(list(zip(maps, grids, strict=True)), options=chosen)
+        made = cls([(inverse, grid) for inverse, (_, grid) in zip(maps, fields, strict=True)], options=chosen)
+        made.hides = tuple(body for body, _ in fields)
+        return made
 
     def update(self, state: newton.State) -> None:
         """Follow the bodies to where a state has them; capturable after a first time."""

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from softmode.scenes.host import host
 from softmode.scenes.meshes import SceneMesh, scene_meshes, scene_poses
+from softmode.splats.cameras.camera import Overlay
 from softmode.splats.cameras.camera_options import CameraOptions
 from softmode.splats.cameras.mesh_raster import MeshRaster, TriangleMeshes
 from softmode.splats.raster.pinhole import PinholeCamera, Vector
@@ -44,6 +45,7 @@ class FilmCamera:
         cameras: The cameras, fixed in the world until `aim` moves one.
         options: Light and sky.
         room: Whether a second light, a table of wood and a room around all are shown.
+        overlay: What else is drawn with the objects, such as radiance fields.
     """
 
     def __init__(
@@ -56,9 +58,11 @@ class FilmCamera:
         *,
         options: CameraOptions | None = None,
         room: bool = False,
+        overlay: Overlay | None = None,
     ) -> None:
         """Upload the meshes and allocate the images."""
-        self.cameras, self._objects, self._marker = tuple(cameras), objects, marker
+        self.cameras, self._objects, self._marker, self._overlay = tuple(cameras), objects, marker, overlay
+        self._drawn = objects if overlay is None else objects.without(overlay.hides)
         self._worlds, device = max(int(model.world_count), 1), model.device
         per_world = [camera for camera in cameras for _ in range(self._worlds)]
         self.views = ViewArrays.from_cameras(per_world, world=[*range(self._worlds)] * len(self.cameras), device=device)
@@ -143,7 +147,10 @@ class FilmCamera:
         elif self._marker is not None and self._marks is not None:
             self._marks.render(self._marker, self._mark_views, mesh_rgb=rgb, mesh_depth=self._no_depth)
             rgb = self._marks.rgb
-        self._splats.render(self._objects, self.views, mesh_rgb=rgb, mesh_depth=meshes.depth)
+        seen, drawn = {"mesh_rgb": rgb, "mesh_depth": meshes.depth}, self._splats
+        drawn.render(self._drawn, self.views, **seen)
+        if self._overlay is not None:
+            self._overlay.draw(self.views, **seen, rgb=drawn.rgb, depth=drawn.depth, alpha=drawn.alpha)
         meshes.join(self._splats, self.rgb)
         return self.rgb
 

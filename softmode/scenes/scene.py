@@ -9,7 +9,9 @@ import newton
 
 from softmode.deformables.solver.solver_base import ReducedSolver
 from softmode.deformables.tools.grips import Grips
+from softmode.errors import ConfigError
 from softmode.objects.soft_object import SoftObject
+from softmode.radiance.march import MarchOptions, RadianceMarch
 from softmode.scenes.binding import BoundSplats
 from softmode.splats.cameras.camera import CameraOptions, Overlay, SplatCamera
 from softmode.splats.cameras.camera_randomization import CameraRandomization
@@ -50,6 +52,31 @@ class Scene(Protocol):
     def reset(self) -> None:
         """Start over."""
         ...
+
+
+def marched_fields(
+    solver: ReducedSolver, objects: Sequence[SoftObject | Sequence[SoftObject]], march: bool | MarchOptions = False
+) -> RadianceMarch | None:
+    """Return the fields of objects that cameras are to march through; None if there are none.
+
+    Args:
+        solver: What moves the objects.
+        objects: The objects of a world in the order of their instances; a list where worlds differ.
+        march: Whether all that have a field are marched, and how; else those of `ObjectConfig.march`.
+
+    Raises:
+        ConfigError: If an object is to be marched that is not the same in all worlds.
+    """
+    fields = []
+    for index, thing in enumerate(objects):
+        if isinstance(thing, SoftObject):
+            grid = thing.radiance if march else thing.marched
+            fields += [] if grid is None else [(index, grid)]
+        elif any(one.marched is not None for one in thing):
+            hint = "give all worlds one object, or leave march out"
+            raise ConfigError("march: worlds hold different objects", hint=hint)
+    options = march if isinstance(march, MarchOptions) else None
+    return RadianceMarch.of_bodies(solver, fields, options=options) if fields else None
 
 
 def cameras_by_size(

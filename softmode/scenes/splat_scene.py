@@ -27,12 +27,12 @@ from softmode.deformables.tools.grips import GripOptions, Grips, add_grip_slots
 from softmode.errors import ConfigError
 from softmode.objects.placed import Placed
 from softmode.pause import cut_circles
-from softmode.radiance.march import MarchOptions, RadianceMarch
+from softmode.radiance.march import MarchOptions
 from softmode.scenes.binding import BoundSplats
 from softmode.scenes.capture import capture_graph, capture_step, require_even
 from softmode.scenes.fixture import Fixture, add_fixture
 from softmode.scenes.recording import Recording
-from softmode.scenes.scene import cameras_by_size
+from softmode.scenes.scene import cameras_by_size, marched_fields
 from softmode.splats.cameras.camera import CameraOptions, SplatCamera
 from softmode.splats.raster.pinhole import PinholeCamera
 from softmode.stages import KERNELS, stage
@@ -96,8 +96,8 @@ class SplatScene:
         camera_options: Light and background.
         grip_slots: Points of each object that may be gripped while the scene runs; see :attr:`grips`.
         grip_options: How stiff such grips are.
-        march: March rays through the radiance fields of objects that have one, instead of drawing splats baked of them:
-            sharper, slower, and without shadows.
+        march: March rays through the radiance fields of all objects that have one, instead of drawing splats baked of
+            them, and how; those of `ObjectConfig.march` are marched without it.
         device: Warp device; the default one if None.
 
     Raises:
@@ -161,18 +161,13 @@ class SplatScene:
             for i in range(len(self.objects) if grip_slots else 0)
         )
         """Grips of each object, that pull and hold it while the scene runs; none without slots."""
-        marched = [(i, thing.radiance) for i, thing in enumerate(self.objects) if march and thing.radiance is not None]
-        if march and not marched:
+        if march and all(thing.radiance is None for thing in self.objects):
             raise ConfigError("march: no object has a radiance field", hint="load one, or leave it out")
-        self.fields: RadianceMarch | None = None
+        self.fields = marched_fields(self.solver, self.objects, march) if cameras else None
         """Radiance fields that cameras march through; None if there are none."""
-        if cameras and marched:
-            how = march if isinstance(march, MarchOptions) else None
-            self.fields = RadianceMarch.of_bodies(self.solver, marched, options=how)
-        hidden = {i for i, _ in marched}
-        shown = [None if i in hidden else thing for i, thing in enumerate(self.objects)]
-        self.splats = BoundSplats(self.model, shown) if cameras and any(thing is not None for thing in shown) else None
-        """The splats of the objects as cameras see them; None without cameras, or if all objects are marched."""
+        self.splats = BoundSplats(self.model, self.objects) if cameras else None
+        """The splats of the objects as cameras see them, those baked of marched fields for their shadows; None without
+        cameras."""
         self.cameras: dict[tuple[int, int], SplatCamera] = {}
         """The cameras by the width and height of their pictures [px]."""
         if cameras:

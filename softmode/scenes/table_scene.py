@@ -28,6 +28,7 @@ from softmode.objects.object_set import ObjectSet
 from softmode.objects.placed import Placed
 from softmode.objects.soft_object import SoftObject
 from softmode.pause import cut_circles
+from softmode.radiance.march import RadianceMarch
 from softmode.robots import control_kernels
 from softmode.robots.arm import ArmDescription
 from softmode.robots.control import ArmControlOptions
@@ -40,7 +41,7 @@ from softmode.scenes.film_camera import FilmCamera, columns_of
 from softmode.scenes.fixture import Fixture, add_fixture
 from softmode.scenes.occupancy import Occupancy
 from softmode.scenes.recording import Recording
-from softmode.scenes.scene import cameras_by_size
+from softmode.scenes.scene import cameras_by_size, marched_fields
 from softmode.splats.cameras.camera import CameraOptions, SplatCamera
 from softmode.splats.cameras.camera_randomization import CameraRandomization
 from softmode.splats.raster.pinhole import PinholeCamera
@@ -174,12 +175,15 @@ class TableScene:
         """The splats of the objects, then those of the marker, as cameras see them; None without cameras."""
         self.cameras: dict[tuple[int, int], SplatCamera] = {}
         """The cameras by the width and height of their pictures [px]."""
+        self.fields: RadianceMarch | None = None
+        """Radiance fields that cameras march through (`ObjectConfig.march`); None if there are none."""
         self.film: FilmCamera | None = None
         """The cameras that people look through; None without any."""
         if cameras or film:
             held = self.occupancy
             choices = {"choices": held.choices, "choice": held.choice} if held.resampled else {}
             marked = () if self.marker is None else (self.marker,)
+            self.fields = marched_fields(self.solver, held.shown)
             self.splats = BoundSplats(self.model, held.shown, others=marked, **choices)
             if self.marker is not None:
                 rest, one = self.splats.table.means.numpy()[:, self.splats.columns[-1]], isinstance(self.marker, Splats)
@@ -191,13 +195,19 @@ class TableScene:
                 put an array of its own here before the first picture, to change the marker's shape."""
         if cameras and self.splats is not None:
             self.cameras = cameras_by_size(
-                self.model, self.splats, cameras, options=camera_options, randomization=camera_randomization
+                self.model,
+                self.splats,
+                cameras,
+                options=camera_options,
+                randomization=camera_randomization,
+                overlay=self.fields,
             )
         if film and self.splats is not None:
             seen, columns = self.splats.arrays, self.splats.columns
             things = slice(0, columns[len(self.splats.indices) - 1].stop)
             goal = None if self.marker is None else columns_of(seen, columns[-1])
-            self.film = FilmCamera(self.model, self.state, columns_of(seen, things), goal, film, room=True)
+            given = (columns_of(seen, things), goal, film)
+            self.film = FilmCamera(self.model, self.state, *given, room=True, overlay=self.fields)
         self._graph: Recording | None = None
         self._camera_graphs: dict[tuple[int, int], Recording] = {}
         if self.occupancy.slots > 1:
@@ -459,6 +469,8 @@ class TableScene:
         """Move the splats of objects and marker to where they are now; capturable after a first time."""
         if self.splats is not None:
             self.splats.update(self.state)
+            if self.fields is not None:
+                self.fields.update(self.state)
             if self.marker is not None:
                 dim, first = (self.world_count, self.marker_points.shape[1]), self.splats.columns[-1].start
                 arrays = (self.marker_points, self.marker_place, first, self.splats.arrays.means)

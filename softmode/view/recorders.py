@@ -16,7 +16,7 @@ from softmode.errors import ConfigError, SolverDiverged
 from softmode.files import PendingFile
 from softmode.objects.soft_object import SoftObject
 from softmode.scenes.host import host
-from softmode.scenes.scene import Scene
+from softmode.scenes.scene import Scene, marched_fields
 from softmode.splats.cameras.camera import CameraOptions, SplatCamera
 from softmode.splats.raster.pinhole import PinholeCamera
 from softmode.view.live_recording import LiveRecording
@@ -73,16 +73,20 @@ def _coordinates(path: Path, objects: Sequence[SoftObject]) -> Recorder:
     return Recorder(path, take, finish, pending.discard)
 
 
-def _film(path: Path, model: newton.Model, picture: LivePicture, seen: PinholeCamera) -> Recorder:
-    """Return what draws every frame with a camera and encodes it."""
+def _film(path: Path, scene: Scene, picture: LivePicture, seen: PinholeCamera) -> Recorder:
+    """Return what draws every frame with a camera and encodes it; fields that are to be marched are."""
     film = Film(path)
     try:
-        camera = SplatCamera(model, picture.bound.arrays, [seen], options=CameraOptions(mesh_samples=4))
+        fields = marched_fields(scene.solver, scene.objects)
+        smooth = CameraOptions(mesh_samples=4)
+        camera = SplatCamera(scene.model, picture.bound.arrays, [seen], options=smooth, overlay=fields)
     except BaseException:
         film.discard()
         raise
 
     def take(time: float, state: newton.State) -> None:
+        if fields is not None:
+            fields.update(state)
         camera.render(state)
         film.add(camera.images(seen.name).numpy()[0].copy(), RECORD_HZ)
 
@@ -121,7 +125,7 @@ def make_recorder(path: Path, scene: Scene, picture: LivePicture, camera: Callab
     if suffix == ".npz":
         return _coordinates(path, scene.objects)
     if suffix == ".mp4":
-        return _film(path, scene.model, picture, camera())
+        return _film(path, scene, picture, camera())
     if suffix in (".usdc", ".usd", ".usda"):
         return _stage(path, scene.model, scene.objects)
     raise ConfigError(f"recording {path} is no .mp4, .npz or .usdc file", hint="name it like out/poke.mp4")

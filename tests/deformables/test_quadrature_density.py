@@ -78,7 +78,7 @@ def test_fog():
 
 
 def test_voids_and_parts():
-    """A hollow shell is filled, a floater is left out, and the report says so."""
+    """A hollow shell is filled, a floater is left out, and the report says so, and where a faint lid closes it."""
 
     def shell(x):
         return (np.abs(np.linalg.norm(x, axis=1) - 0.035) < 0.005) | (np.linalg.norm(x - 0.045, axis=1) < 0.005)
@@ -86,7 +86,9 @@ def test_voids_and_parts():
     filled = quadrature_from_density(opaque(shell), BOX, **FEW)
     assert filled.volume == pytest.approx(4.0 / 3.0 * np.pi * 0.04**3, rel=0.01)
     assert filled.report["filled_share"] == pytest.approx((0.03 / 0.04) ** 3, rel=0.05)
-    assert 1e-3 < filled.report["detached_share"] < 1e-2
+    assert 1e-3 < filled.report["detached_share"] < 1e-2 and filled.report["open_share"] < 1e-3
+    faint = quadrature_from_density(lambda x: np.where(x[:, 2] > 0.025, 0.12, 1.0) * opaque(shell)(x), BOX, **FEW)
+    assert faint.report["open_share"] == pytest.approx((0.03 / 0.04) ** 3, rel=0.1)
     hollow = quadrature_from_density(opaque(shell), BOX, fill_voids=False, **FEW)
     assert hollow.volume == pytest.approx(4.0 / 3.0 * np.pi * (0.04**3 - 0.03**3), rel=0.01)
 

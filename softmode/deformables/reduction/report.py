@@ -48,6 +48,8 @@ surface may bound thin walls."""
 BURIED_SHARE = 0.005
 """Share of a capture's splats deeper than a voxel in its solid above which something hollow may have been filled. Clean
 captures of 20,000 splats have at most 0.0008, a cup that is filled in a few places 0.0085, a filled one 0.09."""
+VOID_SHARE = 0.05
+"""Share of a solid above which a filled void of its field is worth a word."""
 SIZE_ERROR = 0.05
 """Longest edge that may differ so much from the size that was asked for."""
 FAST_FUNCTIONS = 56
@@ -522,6 +524,16 @@ def _check_asset(body: ReducedBody, told: dict[str, float], notes: _Notes) -> No
             f"the field is fog: half the level of its surface adds {100.0 * fog:.0f} % of volume (walls: 0 to 11 %)."
             f" Its solid is taken at {told['quadrature_level_share']:.2g} of full occupancy; cavities may be full",
             "train it with opaque walls (examples/train_field.py), or build from a mesh of the object",
+        )
+    filled, opened = told.get("quadrature_filled_share", 0.0), told.get("quadrature_open_share", 0.0)
+    if max(filled, opened) > VOID_SHARE:
+        what = f"{100.0 * filled:.0f} % of the solid are a void of the field, which was filled"
+        lid = f"; {100.0 * opened:.0f} % are closed by something thin or faint, and may be an opening"
+        notes.find(
+            "warning" if opened > VOID_SHARE else "note",
+            "filled",
+            what + (lid if opened > VOID_SHARE else ""),
+            "if the object is hollow, build from a mesh of it; train with pictures that look into it",
         )
     told_splats = told.get("quadrature_asset_splats", 0.0)
     given = told.get("asset_splats", told_splats)

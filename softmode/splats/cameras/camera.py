@@ -35,6 +35,9 @@ Output = Literal["rgb", "depth", "median_depth", "alpha", "object_id", "segmenta
 class Overlay(Protocol):
     """Something that is neither mesh nor splat and is put into a picture by its depth, such as a radiance field."""
 
+    hides: tuple[int, ...]
+    """Splat objects that it stands for: they cast their shadows, and are not drawn."""
+
     def draw(
         self,
         views: ViewArrays,
@@ -99,6 +102,7 @@ class SplatCamera:
     ) -> None:
         """Upload the meshes and allocate the images."""
         self.model, self.splats, self.cameras, self.overlay = model, splats, tuple(cameras), overlay
+        self._drawn = splats if splats is None or overlay is None else splats.without(overlay.hides)
         self.options = options if options is not None else CameraOptions()
         self.device = model.device
         self.world_count = worlds = max(int(model.world_count), 1)
@@ -289,15 +293,15 @@ class SplatCamera:
         Args:
             state: Where the bodies are.
         """
-        views, meshes, splats, variation = self.views, self._meshes, self.splats, self.variation
+        views, meshes, variation = self.views, self._meshes, self.variation
         given = (self._poses, variation.offset, self._body, state.body_q)
         launch(self.device, kernels.place_cameras, self.view_count, *given, views.world_to_camera)
-        if self._shadow is not None and splats is not None:
-            self._shadow.draw(splats)
+        if self._shadow is not None and self.splats is not None:
+            self._shadow.draw(self.splats)
         meshes.render(state, variation, self._shadow)
         rgb, alpha, object_id = meshes.rgb, None, None
-        if self.rasterizer is not None and splats is not None:
-            self.rasterizer.render(splats, views, mesh_rgb=meshes.rgb, mesh_depth=meshes.depth)
+        if self.rasterizer is not None and self._drawn is not None:
+            self.rasterizer.render(self._drawn, views, mesh_rgb=meshes.rgb, mesh_depth=meshes.depth)
             rgb, alpha, object_id = self.rasterizer.rgb, self.rasterizer.alpha, self.rasterizer.object_id
         if self.overlay is not None:
             seen = {"mesh_rgb": meshes.rgb, "mesh_depth": meshes.depth}

@@ -13,7 +13,7 @@ which is what keeps small images right.
 
 import functools
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -78,6 +78,11 @@ class SplatArrays:
     spanning: wp.array | None = None
     """Columns of the splats that the map of a shadow spans, int32, shape (world_count, M), where worlds differ in
     them; None where every so many splats do."""
+
+    def without(self, objects: Sequence[int]) -> "SplatArrays":
+        """Return them with some objects invisible; the rest is shared memory."""
+        shown = np.where(np.isin(self.object_index.numpy(), objects), np.float32(0.0), self.opacities.numpy())
+        return replace(self, opacities=wp.array(shown, dtype=float, device=self.opacities.device))
 
     @classmethod
     def from_splats(
