@@ -204,6 +204,7 @@ def test_presets_hold_for_every_number_of_worlds(count):
         {"hidden": (0,)},
         {"encoder": "resnet"},
         {"initial_std": 2.0},
+        {"final_std": 2.0},
         {"learning_rate": float("nan")},
         {"rollout_steps": True},
         {"clip_value": -1.0},
