@@ -30,7 +30,7 @@ class Handling:
         strain_limit: Largest principal strain of a safe success.
         force_limit: Largest contact force of a safe success [N]; None for 15 N, or three times the force of each finger
             that holds the heaviest object's weight by friction, if that is more.
-        care: What the reward loses where roughness rises, see `TaskConfig.care`.
+        care: What the reward loses for roughness, see `TaskConfig.care`.
         gentle: Column of that term of the reward, -1 for none.
 
     Attributes:
@@ -62,8 +62,8 @@ class Handling:
         self._limits = (strain_limit, -1.0 if force_limit is None else force_limit, pads, friction, care, gentle)
         self.handled = wp.zeros((worlds, len(HANDLED)), dtype=float, device=device)
         self.safe = wp.zeros(worlds, dtype=wp.bool, device=device)
-        self.step_force, self.step_strain, self.force_limit, self.roughness, self.height = (
-            wp.zeros(worlds, dtype=float, device=device) for _ in range(5)
+        self.step_force, self.step_strain, self.force_limit, self.height = (
+            wp.zeros(worlds, dtype=float, device=device) for _ in range(4)
         )
         self.at_goal = wp.zeros(worlds, dtype=int, device=device)
         self.held_slot, self.falling_slot = (wp.full(worlds, -1, dtype=int, device=device) for _ in range(2))

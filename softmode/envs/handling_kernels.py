@@ -22,8 +22,10 @@ LEAST_FORCE = wp.constant(15.0)
 """Least force limit where none is given [N]."""
 MARGIN = wp.constant(3.0)
 """How many times the force that holds the object's weight it is, where that is more."""
-FADES = wp.constant(0.95)
-"""Share of the roughness of a step that is left in the next one."""
+GENTLE = wp.constant(0.5)
+"""Share of a limit up to which handling costs nothing."""
+ROUGHEST = wp.constant(8.0)
+"""Most that counts beyond it, in limits."""
 
 
 @wp.struct
@@ -35,7 +37,6 @@ class Handling:
     step_force: wp.array[float]  # largest of the last control step [N]
     step_strain: wp.array[float]  # likewise
     force_limit: wp.array[float]  # [N]
-    roughness: wp.array[float]  # of the last control steps, fading
     held_slot: wp.array[int]  # which object is held, -1 for none
     falling_slot: wp.array[int]  # which is no longer, until it has dropped
     grip: wp.array[wp.vec3]  # where in the frame of the tool it was grasped [m]
@@ -43,14 +44,11 @@ class Handling:
 
 
 @wp.func
-def step_roughness(handling: Handling, world: int, strain_limit: float):
-    """Return how much more than gently the objects were handled in the last control step, 0 up to half of each limit.
-
-    It is the logarithm of twice the greater of force and strain, each relative to its limit.
-    """
+def roughness(handling: Handling, world: int, strain_limit: float):
+    """Return how far force or strain of the last control step, whichever is more of its limit, are beyond gentle."""
     force = handling.step_force[world] / wp.max(handling.force_limit[world], 1.0e-6)
     used = wp.max(force, handling.step_strain[world] / strain_limit)
-    return wp.log(wp.max(2.0 * used, 1.0))
+    return wp.clamp(used - GENTLE, 0.0, ROUGHEST)
 
 
 @wp.func
@@ -130,7 +128,7 @@ def judge(
     force_limit: float,  # [N], negative for that of the object's weight
     pad_friction: float,
     friction: int,  # column of the parameters
-    care: float,  # what the reward loses where roughness rises
+    care: float,  # what the reward loses for roughness
     gentle: int,  # column of that term, -1 for none
     state: WorldState,
     result: StepResult,
@@ -155,16 +153,12 @@ def judge(
     pads = wp.sqrt(wp.max(state.parameters[w, friction] * pad_friction, 1.0e-6))
     holds = 0.5 * heaviest * wp.length(gravity[w]) / pads
     handling.force_limit[w] = wp.where(force_limit > 0.0, force_limit, wp.max(LEAST_FORCE, MARGIN * holds))
-    left = FADES * handling.roughness[w]
-    rough = left
     if not fresh[w]:
-        rough = wp.max(left, step_roughness(handling, w, strain_limit))
         handled = handling.handled
         handled[w, Handled.peak_force] = wp.max(handled[w, Handled.peak_force], handling.step_force[w])
         handled[w, Handled.peak_strain] = wp.max(handled[w, Handled.peak_strain], handling.step_strain[w])
     if gentle >= 0:
-        result.terms[w, gentle] = care * (left - rough)
-    handling.roughness[w] = rough
+        result.terms[w, gentle] = -care * roughness(handling, w, strain_limit)
     if grasped(state, w):
         x = state.object_position[w, near]
         offset = wp.transform_point(wp.transform_inverse(tool), x)
@@ -198,6 +192,5 @@ def forget_handling(world_mask: wp.array[wp.bool], handling: Handling):
         handling.safe[w] = False
         handling.step_force[w] = 0.0
         handling.step_strain[w] = 0.0
-        handling.roughness[w] = 0.0
         handling.held_slot[w] = -1
         handling.falling_slot[w] = -1
