@@ -22,6 +22,7 @@ from benchmarks.baselines.vbd import kuhn_interpolation
 from benchmarks.peers_vbd import CELLS, DT, PLACE, RADIUS, SIZE, STEPS, SUBSTEPS, Peer
 from benchmarks.robustness import last_infos
 from softmode.envs import scripted_policy
+from softmode.learning.config_values import with_config
 from softmode.learning.intervals import wilson_interval
 from softmode.learning.policy import EVALUATION_SEED, load_policy
 from softmode.objects.task_objects import BEAM_MATERIAL
@@ -44,8 +45,8 @@ class OtherPhysics:
         self.peer = peer = Peer(worlds, self.scene.device)
         lines = [np.linspace(-0.5 * size, 0.5 * size, cells + 1) for size, cells in zip(SIZE, CELLS, strict=True)]
         points = self.scene.soft.body.surface.points
-        inside = np.clip(points - points.mean(axis=0) * [1.0, 0.0, 0.0], *(0.4999 * np.array([[-1.0], [1.0]]) * SIZE))
-        self.samples = kuhn_interpolation(lines, inside)
+        half = 0.4999 * np.array(SIZE)
+        self.samples = kuhn_interpolation(lines, np.clip(points - 0.5 * (points.min(0) + points.max(0)), -half, half))
         friction = np.sqrt(self.scene.config.material.friction * self.scene.config.arm.gripper.friction)
         peer.model.soft_contact_mu = float(friction)
         self.mass = peer.model.particle_mass.numpy().reshape(worlds, -1, 1)
@@ -54,7 +55,7 @@ class OtherPhysics:
 
     def begin(self, parameters: np.ndarray, columns: dict[str, int]) -> None:
         """Put arm and beam of every world where a reset has put them."""
-        turn = Rotation.from_euler("z", parameters[:, columns["yaw"]]).as_matrix()
+        turn = Rotation.from_euler("z", parameters[:, columns["yaw"], None]).as_matrix()
         place = np.einsum("wab,wib->wia", turn, self.rest)
         place[..., :2] += parameters[:, None, columns["position"] : columns["position"] + 2]
         place[..., 2] += RADIUS + 0.5 * SIZE[2]
@@ -84,16 +85,16 @@ class OtherPhysics:
     def fingers(self) -> tuple[np.ndarray, np.ndarray]:
         """Return places and speeds of the fingers, (worlds, 2) [m, m/s]."""
         arrays = (self.peer.state.joint_q, self.peer.state.joint_qd)
-        return tuple(array.numpy().reshape(self.task.world_count, -1)[:, -2:] for array in arrays)  # type: ignore[return-value]
+        q, qd = (array.numpy().reshape(self.task.world_count, -1)[:, -2:] for array in arrays)
+        return q, qd
 
     def measure(self) -> None:
         """Write what observations are made of."""
         scene, peer, gripper = self.scene, self.peer, self.scene.config.arm.gripper
         scene.state.joint_q.assign(peer.state.joint_q)
         scene.controller.measure(scene.state)
-        place, speed = (
-            array.numpy().reshape(self.mass.shape[0], -1, 3) for array in (peer.state.particle_q, peer.state.particle_qd)
-        )
+        arrays = (peer.state.particle_q, peer.state.particle_qd)
+        place, speed = (array.numpy().reshape(self.mass.shape[0], -1, 3) for array in arrays)
         total = self.mass.sum(axis=1)
         for array, values in ((scene.object_position, place), (scene.object_velocity, speed)):
             array.assign(((self.mass * values).sum(axis=1) / total).astype(np.float32).reshape(array.shape + (3,)))
@@ -137,7 +138,7 @@ def main() -> None:
     args = parser.parse_args()
     wp.config.log_level = wp.LOG_WARNING
     trained = None if args.policy is None else load_policy(args.policy)
-    options: dict[str, Any] = {"preset": "beam"} if trained is None else trained.env_options
+    options: dict[str, Any] = {"preset": "beam"} if trained is None else with_config(trained.env, trained.env_options)
     name = "softmode/LiftSoft-v0" if trained is None else trained.env
     env: Any = gym.make_vec(name, num_envs=args.episodes, autoreset_mode="Disabled", device=args.device, **options)
     task = env.unwrapped.task
