@@ -50,17 +50,22 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=60)
     parser.add_argument("--warmup", type=int, default=40, help="control steps before the clock starts")
     options = parser.parse_args()
-    wp.config.log_level = wp.LOG_WARNING
-    for name in [name for name in sys.modules if name.startswith("newton._src.")]:
-        wp.set_module_options({"enable_backward": False}, module=sys.modules[name])
-    surface = importlib.import_module("newton._src.geometry.soft_contacts_sdf")
-    for kernel in (surface.create_soft_edge_contacts, surface.create_soft_face_contacts):
-        kernel.module.options["enable_backward"] = False  # modules of their own: minutes of compilation with adjoints
+    without_adjoints()
     wp.set_device(options.device)
     device = wp.get_device(options.device)
     print(f"{device.name or device}: Newton {newton.__version__}")
     for count in options.worlds or ([64, 1024, 4096] if device.is_cuda else [1]):
         report(count, device, options)
+
+
+def without_adjoints() -> None:
+    """Compile Newton's kernels without adjoints, which take minutes."""
+    wp.config.log_level = wp.LOG_WARNING
+    for name in [name for name in sys.modules if name.startswith("newton._src.")]:
+        wp.set_module_options({"enable_backward": False}, module=sys.modules[name])
+    surface = importlib.import_module("newton._src.geometry.soft_contacts_sdf")
+    for kernel in (surface.create_soft_edge_contacts, surface.create_soft_face_contacts):
+        kernel.module.options["enable_backward"] = False  # modules of their own
 
 
 class Peer:

@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import newton
 import numpy as np
-import warp as wp
 from scipy.spatial.transform import Rotation
 
 from benchmarks.baselines.vbd import kuhn_interpolation
-from benchmarks.peers_vbd import CELLS, DT, PLACE, RADIUS, SIZE, STEPS, SUBSTEPS, Peer
+from benchmarks.peers_vbd import CELLS, DT, PLACE, RADIUS, SIZE, STEPS, SUBSTEPS, Peer, without_adjoints
 from benchmarks.robustness import last_infos
 from softmode.envs import scripted_policy
 from softmode.learning.config_values import with_config
@@ -65,8 +65,6 @@ class OtherPhysics:
             array.zero_()
         state.joint_q.assign(self.scene.state.joint_q)
         self.peer.target.assign(self.scene.controller.commanded_q)
-        import newton
-
         newton.eval_fk(self.peer.model, state.joint_q, state.joint_qd, state)
         self.before = np.zeros((self.task.world_count, 2))
 
@@ -97,7 +95,7 @@ class OtherPhysics:
         place, speed = (array.numpy().reshape(self.mass.shape[0], -1, 3) for array in arrays)
         total = self.mass.sum(axis=1)
         for array, values in ((scene.object_position, place), (scene.object_velocity, speed)):
-            array.assign(((self.mass * values).sum(axis=1) / total).astype(np.float32).reshape(array.shape + (3,)))
+            array.assign(((self.mass * values).sum(axis=1) / total).astype(np.float32).reshape((*array.shape, 3)))
         samples = np.stack([self.samples @ values for values in place])
         scene.state.particle_q.assign(samples.reshape(-1, 3).astype(np.float32))
         q, qd = self.fingers()
@@ -112,7 +110,7 @@ class OtherPhysics:
 def play(env: Any, other: OtherPhysics | None, policy: Any, forces: str, seed: int) -> dict[str, np.ndarray]:
     """Play an episode in every world; return what the last infos say."""
     task, random = env.unwrapped.task, np.random.default_rng(seed)
-    observation, infos = env.reset(seed=seed, options={"youngs_modulus": BEAM_MATERIAL.youngs_modulus})
+    observation, _ = env.reset(seed=seed, options={"youngs_modulus": BEAM_MATERIAL.youngs_modulus})
     if other is not None:
         other.begin(task.table.values.numpy(), {name: task.table.column(name) for name in ("yaw", "position")})
     columns = task.segments["finger_force"][0]
@@ -136,7 +134,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=EVALUATION_SEED)
     parser.add_argument("--device", default="cpu")
     args = parser.parse_args()
-    wp.config.log_level = wp.LOG_WARNING
+    without_adjoints()
     trained = None if args.policy is None else load_policy(args.policy)
     options: dict[str, Any] = {"preset": "beam"} if trained is None else with_config(trained.env, trained.env_options)
     name = "softmode/LiftSoft-v0" if trained is None else trained.env
