@@ -22,7 +22,6 @@ from benchmarks.baselines.vbd import kuhn_interpolation
 from benchmarks.peers_vbd import CELLS, DT, PLACE, RADIUS, SIZE, STEPS, SUBSTEPS, Peer, without_adjoints
 from benchmarks.robustness import last_infos
 from softmode.envs import scripted_policy
-from softmode.learning.config_values import with_config
 from softmode.learning.intervals import wilson_interval
 from softmode.learning.policy import EVALUATION_SEED, load_policy
 from softmode.objects.task_objects import BEAM_MATERIAL
@@ -136,7 +135,7 @@ def main() -> None:
     args = parser.parse_args()
     without_adjoints()
     trained = None if args.policy is None else load_policy(args.policy)
-    options: dict[str, Any] = {"preset": "beam"} if trained is None else with_config(trained.env, trained.env_options)
+    options = {"preset": "beam"} if trained is None else {**trained.env_options, "preset": "beam"}
     name = "softmode/LiftSoft-v0" if trained is None else trained.env
     env: Any = gym.make_vec(name, num_envs=args.episodes, autoreset_mode="Disabled", device=args.device, **options)
     task = env.unwrapped.task
