@@ -195,6 +195,18 @@ def test_presets_hold_for_every_number_of_worlds(count):
     assert Hyperparameters.from_json(options.to_json()) == options
 
 
+def test_the_bound_of_the_noise_falls_geometrically():
+    """Half-way through the run it is the root of both ends' product."""
+    from softmode.learning.networks import Actor
+    from softmode.learning.spaces import Interface
+
+    options = Hyperparameters(initial_std=0.8, max_std=0.8, final_std=0.2)
+    actor = Actor(Interface.of(PointVectorEnv(1)), options)
+    for progress, bound in ((0.0, 0.8), (0.5, 0.4), (1.0, 0.2)):
+        actor.bound_std(progress)
+        assert actor.log_std.exp().detach().numpy() == pytest.approx(bound, rel=1e-5)
+
+
 @pytest.mark.parametrize(
     "wrong",
     [
