@@ -71,7 +71,5 @@ def evaluate(state: WorldState, plan: Plan, result: StepResult):
     result.terms[w, Term.reach] = reach
     result.terms[w, Term.force] = 1.5 * reach * match
     result.terms[w, Term.hold] = wp.where(there, 2.0, 0.0)
-    # beyond 2.3 times the goal the logarithm keeps a slope back
-    far = 0.2 * wp.log(wp.max(force / (2.3 * goal), 1.0))
-    result.terms[w, Term.overshoot] = -wp.clamp((force - 1.3 * goal) / goal, 0.0, 1.0) - far
+    result.terms[w, Term.overshoot] = -wp.clamp((force - 1.3 * goal) / goal, 0.0, 1.0)
     count_held(there, plan.hold_steps, result, w)

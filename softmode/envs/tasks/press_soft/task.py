@@ -118,7 +118,7 @@ class PressSoft(Task):
     Young's modulus is random over two decades and not observed: the same step means another force on every pad.
 
     Reward terms: ``reach`` (0..1, finger tips to the middle of the pad's top), ``force`` (0..1.5, nearness to the goal
-    force while there), ``hold`` (0 or 2, within the tolerance), ``overshoot`` (at most 0, beyond 1.3 times the goal).
+    force while there), ``hold`` (0 or 2, within the tolerance), ``overshoot`` (-1..0, beyond 1.3 times the goal).
     Success: within the tolerance, over the middle of the pad, for ``hold_steps`` steps in a row.
     """
 

@@ -8,10 +8,8 @@ from softmode.envs.reward_kernels import StepResult, WorldState, count_held, sur
 
 wp.set_module_options({"enable_backward": False})
 
-Term = IntEnum("Term", "reach approach goal rest", start=0)
+Term = IntEnum("Term", "reach progress goal rest", start=0)
 Metric = IntEnum("Metric", "goal_distance yaw_error", start=0)
-LONGEST = wp.constant(0.3)
-"""Distance from the goal from which `approach` is 0 [m]."""
 
 
 @wp.struct
@@ -30,12 +28,14 @@ class Plan:
     column_object_heading: int
     column_push_offset: int
     rest: wp.array2d[wp.vec3]  # of the observed points, relative to the centre of mass [m], (world_count, points)
+    before: wp.array[float]  # distance one step earlier [m], negative in the first step
     push_distances: wp.array[float]  # from the unscaled object's centre to the tool behind it [m]
     push_height: float  # [m]
     goal_tolerance: float  # [m]
     yaw_tolerance: float  # [rad], negative where yaw does not matter
     rest_speed: float  # [m/s]
     hold_steps: int
+    translation_scale: float  # longest tool step [m]
 
 
 @wp.kernel
@@ -97,8 +97,12 @@ def evaluate(state: WorldState, plan: Plan, result: StepResult):
     if there:
         reach = 1.0
     resting = there and wp.length(state.object_velocity[w, 0]) <= plan.rest_speed
+    progress = float(0.0)
+    if plan.before[w] >= 0.0:
+        progress = wp.clamp((plan.before[w] - distance) / plan.translation_scale, -1.0, 1.0)
+    plan.before[w] = distance
     result.terms[w, Term.reach] = 0.5 * reach
-    result.terms[w, Term.approach] = 2.0 * wp.max(1.0 - distance / LONGEST, 0.0)
+    result.terms[w, Term.progress] = progress
     result.terms[w, Term.goal] = nearness
     result.terms[w, Term.rest] = wp.where(resting, 2.0, 0.0)
     count_held(resting, plan.hold_steps, result, w)

@@ -21,6 +21,7 @@ from softmode.envs.soft_env import SoftEnv
 from softmode.envs.soft_vector_env import SoftVectorEnv
 from softmode.envs.task import Task
 from softmode.envs.task_config import TaskConfig
+from softmode.envs.task_kernels import forget
 from softmode.envs.tasks.push_soft import kernels
 from softmode.objects.config import ObjectConfig
 from softmode.objects.soft_object import SoftObject
@@ -97,9 +98,9 @@ class PushSoftConfig(TaskConfig):
 class PushSoft(Task):
     """Push the object to a goal on the table and leave it there at rest.
 
-    Reward terms: ``reach`` (0..0.5, tool to the side of the object that faces away from the goal), ``approach``
-    (0..2, how little of 30 cm to the goal is left), ``goal`` (0..1, nearness to the goal, steep there), ``rest`` (0 or
-    2, at rest at the goal). Success: at rest at the goal for ``hold_steps`` steps in a row.
+    Reward terms: ``reach`` (0..0.5, tool to the side of the object that faces away from the goal), ``progress``
+    (-1..1, object towards the goal in this step, over the longest tool step), ``goal`` (0..1, nearness to the goal),
+    ``rest`` (0 or 2, at rest at the goal). Success: at rest at the goal for ``hold_steps`` steps in a row.
 
     Yaw is the rotation about the vertical that best maps the observed surface points from rest to where they are, so
     that it is defined for a deformed object.
@@ -115,7 +116,8 @@ class PushSoft(Task):
     metric_names = tuple(kernels.Metric.__members__)
 
     def build(self) -> None:
-        """Measure the objects."""
+        """Allocate what the reward remembers."""
+        self.before = wp.zeros(self.world_count, dtype=float, device=self.device)
         surfaces = [thing.body.surface.points for thing in self.scene.occupancy.choices]
         rest = [surface[points] for surface, points in zip(surfaces, self.points_of_choices, strict=True)]
         self.rest = self.scene.occupancy.follow(np.stack(rest), wp.vec3)
@@ -165,6 +167,15 @@ class PushSoft(Task):
             Segment("object_heading", 2, -1.0, 1.0),
             Segment("push_offset", 3, -4.0, 4.0),
         )
+
+    def clear(self) -> None:
+        """Forget how long the object rested and where it was."""
+        super().clear()
+        self.launch(forget, [self.scene.world_mask, -1.0], [self.before])
+
+    def state_arrays(self) -> dict[str, wp.array]:
+        """Add how far the object was from its goal a step ago."""
+        return {**super().state_arrays(), "before": self.before}
 
     def marker(self) -> Marker:
         """Return what draws the outline of an object, to lie on the table."""

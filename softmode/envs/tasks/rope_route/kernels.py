@@ -11,9 +11,6 @@ wp.set_module_options({"enable_backward": False})
 Term = IntEnum("Term", "reach grasp route goal hold", start=0)
 Metric = IntEnum("Metric", "goal_distance least_winding highest_point grasp_distance", start=0)
 
-HIGH = wp.constant(0.02)
-"""Height of the rope over the pegs from which it counts half [m]."""
-
 
 @wp.struct
 class Ropes:
@@ -133,11 +130,9 @@ def evaluate(state: WorldState, plan: Plan, result: StepResult):
     pegs = plan.peg_position.shape[0]
     passed = float(0.0)
     for p in range(pegs):
-        passed += wp.clamp(result.observation[w, plan.column_winding + p] / plan.winding, -2.0, 1.0) / float(pegs)
-    over = result.metrics[w, Metric.highest_point] - plan.peg_height
-    if passed > 0.0:  # a rope over the pegs has half of what it passes
-        passed = passed * (1.0 - 0.5 * wp.clamp(over / HIGH, 0.0, 1.0))
-    routed = over < 0.0 and result.metrics[w, Metric.least_winding] >= plan.winding
+        passed += wp.clamp(result.observation[w, plan.column_winding + p] / plan.winding, -1.0, 1.0) / float(pegs)
+    low = result.metrics[w, Metric.highest_point] < plan.peg_height
+    routed = low and result.metrics[w, Metric.least_winding] >= plan.winding
     there = routed and distance <= plan.goal_tolerance
     result.terms[w, Term.reach] = 1.0 - wp.tanh(10.0 * near)
     result.terms[w, Term.grasp] = wp.where(grasped(state, w) and near < 0.03, 0.5, 0.0)
