@@ -216,6 +216,7 @@ def test_the_bound_of_the_noise_falls_geometrically():
         {"hidden": (0,)},
         {"encoder": "resnet"},
         {"initial_std": 2.0},
+        {"final_std": 2.0},
         {"learning_rate": float("nan")},
         {"rollout_steps": True},
         {"clip_value": -1.0},

@@ -134,10 +134,9 @@ class RopeRoute(Task):
     tail to end; its sign is the side.
 
     Reward terms: ``reach`` (0..1, tool to the point to grasp), ``grasp`` (0 or 0.5, both fingers touch the rope there),
-    ``route`` (-4..2, winding on the right side, mean over the pegs, half as much over them), ``goal`` (0..2, end to the
-    goal, the more the better routed), ``hold`` (0 or 2, routed and at the goal). Success: all pegs passed on their side
-    by ``winding`` at least, the whole rope below the pegs' top, and its end at the goal, for ``hold_steps`` steps in a
-    row.
+    ``route`` (-2..2, winding on the right side, mean over the pegs), ``goal`` (0..2, end to the goal, the more the
+    better routed), ``hold`` (0 or 2, routed and at the goal). Success: all pegs passed on their side by ``winding`` at
+    least, the whole rope below the pegs' top, and its end at the goal, for ``hold_steps`` steps in a row.
     """
 
     config: RopeRouteConfig
