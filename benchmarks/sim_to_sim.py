@@ -135,7 +135,7 @@ def main() -> None:
     args = parser.parse_args()
     without_adjoints()
     trained = None if args.policy is None else load_policy(args.policy)
-    options = {"preset": "beam"} if trained is None else {**trained.env_options, "preset": "beam"}
+    options: dict[str, Any] = {"preset": "beam"} if trained is None else {**trained.env_options, "preset": "beam"}
     name = "softmode/LiftSoft-v0" if trained is None else trained.env
     env: Any = gym.make_vec(name, num_envs=args.episodes, autoreset_mode="Disabled", device=args.device, **options)
     task = env.unwrapped.task
