@@ -64,7 +64,7 @@ class Hyperparameters:
     max_std: float = 1.0
     """Upper bound of the standard deviation at the start of the run."""
     final_std: float | None = None
-    """That at its end, to which it falls geometrically; stays if omitted. A gripper is gentle only with little noise."""
+    """That at its end, to which it falls geometrically; it stays if omitted. Noise of a gripper is force."""
     bound: Literal["clamp", "tanh"] = "clamp"
     """How actions are kept in range: clamped on the way to the environment, or squashed."""
     normalize_observations: bool = True
