@@ -1,10 +1,10 @@
-"""PPO from states for LiftSoft on 12 objects, played on them and on 6 objects that it never saw.
+"""PPO from states for LiftSoft on ten presets, played on them and on five that it never saw.
 
-The objects are fifteen presets, a box, a cylinder and a sphere; every third by name is unseen. Worlds get another
-object at every reset. Bodies are built into the cache first; the time limit is that of training.
+Of the fifteen presets every third by name is unseen. Worlds get another object at every reset.
 
-Run: ``python -m benchmarks.objects_ppo [--time-limit 411] [--num-envs 4096] [--device cuda:0]``; on a CPU add
-``--device cpu --num-envs 8 --eval-envs 8 --time-limit 30``, which is too short to learn anything.
+Run: ``python -m benchmarks.objects_ppo [--time-limit 411] [--num-envs 4096] [--device cuda:0]``, or with
+``--policy FILE`` for the table of a policy; on a CPU add ``--device cpu --num-envs 8 --episodes 2 --time-limit 30``,
+which is too short to learn anything.
 """
 
 import argparse
@@ -13,83 +13,60 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import torch
-import warp as wp
 
 from benchmarks.object_sets import build_all
+from benchmarks.robustness import last_infos
 from softmode.envs import LiftSoftConfig
-from softmode.envs.presets import RL_BUILD
-from softmode.learning.policy import load_policy
+from softmode.learning.intervals import wilson_interval
+from softmode.learning.policy import EVALUATION_SEED, Policy, load_policy
 from softmode.learning.train_options import TrainOptions
 from softmode.learning.trainer import train
-from softmode.objects import PRESETS, ObjectConfig, ObjectSet
+from softmode.objects import PRESETS, ObjectSet
 
-EVALUATION_SEED = 1_000_000_000
-"""Beyond the seeds of training."""
-
-
-def eighteen(**options: Any) -> ObjectSet:
-    """Return all objects by name."""
-    shapes = {"box": (0.06, 0.05, 0.05), "cylinder": (0.05, 0.05, 0.07), "sphere": (0.06, 0.06, 0.06)}
-    named: dict[str, str | ObjectConfig] = {name: name for name in PRESETS}
-    for shape, extents in shapes.items():
-        named[shape] = ObjectConfig(shape=shape, extents=extents, surface_count=200, build=RL_BUILD)  # type: ignore[arg-type]
-    return ObjectSet(tuple(named[name] for name in sorted(named)), **options)
+SEEN, UNSEEN = ([name for k, name in enumerate(sorted(PRESETS)) if (k % 3 == 2) == last] for last in (False, True))
+OPTIONS: dict[str, Any] = {
+    "config": {"objects": {"objects": SEEN, "resample": True}, "youngs_modulus_range": None},
+}
+"""Environment of the training."""
 
 
-def make_env(num_envs: int, device: str, weights: tuple[float, ...]) -> Any:
-    """Return LiftSoft with another object at every reset, drawn by weights."""
-    config = LiftSoftConfig(objects=eighteen(weights=weights, resample=True), youngs_modulus_range=None)
-    return gym.make_vec("softmode/LiftSoft-v0", num_envs=num_envs, config=config, device=device, output="torch")
-
-
-def play(env: Any, policy: Any, names: tuple[str, ...]) -> None:
-    """Play one episode per world; print how many succeeded, per object."""
-    observation, info = env.reset(seed=EVALUATION_SEED)
-    which = np.asarray(torch.as_tensor(info["object"]).cpu())
-    running, won = np.ones(len(which), bool), np.zeros(len(which), bool)
-    while running.any():
-        observation, _, terminated, truncated, info = env.step(policy(observation))
-        won |= running & np.asarray(torch.as_tensor(info["is_success"]).cpu()).astype(bool)
-        running &= ~np.asarray((terminated | truncated).cpu())
-    for k in np.unique(which):
-        own = which == k
-        print(f"  {names[k]:10s}{won[own].sum():5d} of {own.sum():4d} = {100 * won[own].mean():5.1f} %")
-    print(f"  all       {100 * won.mean():.1f} %", flush=True)
+def table(policy: Policy, episodes: int, device: str) -> None:
+    """Print how often a policy lifts each object, and how often safely."""
+    print("| object | success | 95 % | safe success | peak force at the median [N] |\n|---|---|---|---|---|")
+    for label, names in (("unseen", UNSEEN), ("seen", SEEN)):
+        config = LiftSoftConfig(objects=ObjectSet(tuple(names), order="in_turn"), youngs_modulus_range=None)
+        count = episodes * len(names)
+        env: Any = gym.make_vec(policy.env, num_envs=count, config=config, device=device, autoreset_mode="Disabled")
+        observation, _ = env.reset(seed=EVALUATION_SEED)
+        found = last_infos(env, policy, observation)
+        env.close()
+        for name, part in [*zip(names, range(len(names)), strict=True), (f"all {len(names)} {label}", None)]:
+            own = slice(None) if part is None else slice(part, None, len(names))
+            won, safe, force = (found[key][own] for key in ("is_success", "is_safe_success", "peak_force"))
+            low, high = (100.0 * bound for bound in wilson_interval(won.sum(), len(won)))
+            share = f"{100.0 * won.mean():.1f} % | {low:.0f} to {high:.0f} %"
+            print(f"| {name} | {share} | {100.0 * safe.mean():.0f} % | {np.median(force):.1f} |", flush=True)
 
 
 def main() -> None:
-    """Train and evaluate."""
+    """Train, unless a policy is given, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--policy", type=Path, help="file of a policy, in place of a training")
     parser.add_argument("--time-limit", type=float, default=411.0, help="seconds of training")
     parser.add_argument("--num-envs", type=int, default=4096)
-    parser.add_argument("--eval-envs", type=int, default=1024)
+    parser.add_argument("--episodes", type=int, default=100, help="of every object")
     parser.add_argument("--device", default="cuda:0")
     parser.add_argument("--run-dir", type=Path, default=Path("out/objects_ppo"))
     given = parser.parse_args()
-    wp.config.log_level = wp.LOG_WARNING
-    objects = eighteen()
-    build_all(objects)
-    unseen = tuple(float(k % 3 == 2) for k in range(len(objects.names)))
-    seen = tuple(1.0 - weight for weight in unseen)
-    env = make_env(given.num_envs, given.device, seen)
-    options = TrainOptions(
-        env="softmode/LiftSoft-v0",
-        num_envs=given.num_envs,
-        device=given.device,
-        time_limit=given.time_limit,
-        total_steps=10**10,
-        run_dir=given.run_dir,
-        eval_episodes=0,
-    )
-    result = train(options, make=lambda *_: env)
-    print(f"trained for {result.seconds:.0f} s, {result.env_steps:,} steps")
-    policy = load_policy(result.run_dir / "latest.npz", given.device)
-    for label, weights in (("unseen", unseen), ("seen", seen)):
-        env = make_env(given.eval_envs, given.device, weights)
-        print(f"{label} objects:")
-        play(env, policy, objects.names)
-        env.close()
+    build_all(ObjectSet((*SEEN, *UNSEEN)))
+    path = given.policy
+    if path is None:
+        options = {"num_envs": given.num_envs, "device": given.device, "time_limit": given.time_limit}
+        options |= {"env_options": OPTIONS, "run_dir": given.run_dir, "eval_episodes": 0}
+        result = train(TrainOptions(env="softmode/LiftSoft-v0", total_steps=10**10, **options))
+        print(f"trained for {result.seconds:.0f} s, {result.env_steps:,} steps")
+        path = result.run_dir / "latest.npz"
+    table(load_policy(path), given.episodes, given.device)
 
 
 if __name__ == "__main__":

@@ -50,17 +50,22 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=60)
     parser.add_argument("--warmup", type=int, default=40, help="control steps before the clock starts")
     options = parser.parse_args()
-    wp.config.log_level = wp.LOG_WARNING
-    for name in [name for name in sys.modules if name.startswith("newton._src.")]:
-        wp.set_module_options({"enable_backward": False}, module=sys.modules[name])
-    surface = importlib.import_module("newton._src.geometry.soft_contacts_sdf")
-    for kernel in (surface.create_soft_edge_contacts, surface.create_soft_face_contacts):
-        kernel.module.options["enable_backward"] = False  # modules of their own: minutes of compilation with adjoints
+    without_adjoints()
     wp.set_device(options.device)
     device = wp.get_device(options.device)
     print(f"{device.name or device}: Newton {newton.__version__}")
     for count in options.worlds or ([64, 1024, 4096] if device.is_cuda else [1]):
         report(count, device, options)
+
+
+def without_adjoints() -> None:
+    """Compile Newton's kernels without adjoints, which take minutes."""
+    wp.config.log_level = wp.LOG_WARNING
+    for name in [name for name in sys.modules if name.startswith("newton._src.")]:
+        wp.set_module_options({"enable_backward": False}, module=sys.modules[name])
+    surface = importlib.import_module("newton._src.geometry.soft_contacts_sdf")
+    for kernel in (surface.create_soft_edge_contacts, surface.create_soft_face_contacts):
+        kernel.module.options["enable_backward"] = False  # modules of their own
 
 
 class Peer:
@@ -103,7 +108,7 @@ class Peer:
         self._step: Any = wp.zeros(1, dtype=int, device=device)
         self._home: Any = wp.array(home, dtype=float, device=device)
         self._grip = 0.5 * arm.home_opening, 0.5 * SIZE[1] - 0.002
-        self._target = self.control.joint_target_q.reshape((worlds, len(home)))
+        self.target = self.control.joint_target_q.reshape((worlds, len(home)))
 
     def _coupled(self, bodies: list[int], joints: list[int], shapes: list[int], proxies: list[int]) -> Any:
         """Return MuJoCo-Warp and VBD, coupled by proxies of hand and fingers."""
@@ -141,17 +146,21 @@ class Peer:
 
     def pressed(self) -> float:
         """Return the share of worlds in which something keeps both fingers from where they are driven, by 0.1 mm."""
-        apart = self.state.joint_q.numpy().reshape(self.worlds, -1)[:, -2:] - self._target.numpy()[:, -2:]
+        apart = self.state.joint_q.numpy().reshape(self.worlds, -1)[:, -2:] - self.target.numpy()[:, -2:]
         return float((apart > 1.0e-4).all(axis=1).mean())
 
     def control_step(self) -> None:
         """Launch the steps of a control step, an even number."""
-        wp.launch(act_arm, self.worlds, [self._step, self._home, *self._grip], [self._target], device=self.device)
+        wp.launch(act_arm, self.worlds, [self._step, self._home, *self._grip], [self.target], device=self.device)
         wp.launch(count_step, 1, [self._step], device=self.device)
         for _ in range(STEPS * SUBSTEPS):
-            self.state.clear_forces()
-            self.solver.step(self.state, self._next, self.control, None, DT / SUBSTEPS)
-            self.state, self._next = self._next, self.state
+            self.substep()
+
+    def substep(self) -> None:
+        """Launch a step of both solvers."""
+        self.state.clear_forces()
+        self.solver.step(self.state, self._next, self.control, None, DT / SUBSTEPS)
+        self.state, self._next = self._next, self.state
 
 
 def add_beam(world: newton.ModelBuilder) -> int:

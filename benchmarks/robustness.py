@@ -16,6 +16,7 @@ import gymnasium as gym
 import numpy as np
 
 from softmode.envs.disturbances import LIMITS, neutral
+from softmode.learning.config_values import with_config
 from softmode.learning.intervals import wilson_interval
 from softmode.learning.policy import EVALUATION_SEED, Policy, load_policy
 
@@ -50,7 +51,7 @@ def rows(table: Mapping[str, Any]) -> list[tuple[str, str, dict[str, Any]]]:
 def worlds_of(policy: Policy, count: int, **options: Any) -> Any:
     """Return worlds of the policy's environment in which all disturbances can be set."""
     on = {f"{name}_range": (neutral(name), max(neutral(name), 3.0 * ("delay" in name))) for name in LIMITS}
-    given = {**policy.env_options, **on, **options}
+    given = with_config(policy.env, {**policy.env_options, **on, **options})
     return gym.make_vec(policy.env, num_envs=count, autoreset_mode="Disabled", **given)
 
 

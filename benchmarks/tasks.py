@@ -92,10 +92,11 @@ def play(task: str, policy: str, episodes: int, seed: int, device: str | None) -
     """Return in how many episodes a policy succeeded, and in how many safely."""
     from benchmarks.robustness import last_infos
     from softmode.envs import scripted_policy
+    from softmode.learning.config_values import with_config
     from softmode.learning.policy import load_policy
 
     trained = None if policy == "scripted" else load_policy(policy)
-    options: dict[str, Any] = {} if trained is None else trained.env_options
+    options: dict[str, Any] = {} if trained is None else with_config(trained.env, trained.env_options)
     env: Any = gym.make_vec(IDS[task], num_envs=episodes, autoreset_mode="Disabled", device=device, **options)
     player: Any = scripted_policy(env) if trained is None else trained
     observation, _ = env.reset(seed=seed)

@@ -30,7 +30,7 @@ class Handling:
         strain_limit: Largest principal strain of a safe success.
         force_limit: Largest contact force of a safe success [N]; None for 15 N, or three times the force of each finger
             that holds the heaviest object's weight by friction, if that is more.
-        care: What the reward loses where the logarithm of the peaks rises, see `roughness`.
+        care: What the reward loses for roughness, see `TaskConfig.care`.
         gentle: Column of that term of the reward, -1 for none.
 
     Attributes:

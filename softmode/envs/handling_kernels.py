@@ -22,6 +22,10 @@ LEAST_FORCE = wp.constant(15.0)
 """Least force limit where none is given [N]."""
 MARGIN = wp.constant(3.0)
 """How many times the force that holds the object's weight it is, where that is more."""
+GENTLE = wp.constant(0.5)
+"""Share of a limit up to which handling costs nothing."""
+ROUGHEST = wp.constant(8.0)
+"""Most that counts beyond it, in limits."""
 
 
 @wp.struct
@@ -41,13 +45,10 @@ class Handling:
 
 @wp.func
 def roughness(handling: Handling, world: int, strain_limit: float):
-    """Return how much more than gently the objects were handled so far, 0 up to half of each limit.
-
-    It is the logarithm of twice the greater of peak force and peak strain, each relative to its limit.
-    """
-    force = handling.handled[world, Handled.peak_force] / wp.max(handling.force_limit[world], 1.0e-6)
-    used = wp.max(force, handling.handled[world, Handled.peak_strain] / strain_limit)
-    return wp.log(wp.max(2.0 * used, 1.0))
+    """Return how far force or strain of the last control step, whichever is more of its limit, are beyond gentle."""
+    force = handling.step_force[world] / wp.max(handling.force_limit[world], 1.0e-6)
+    used = wp.max(force, handling.step_strain[world] / strain_limit)
+    return wp.clamp(used - GENTLE, 0.0, ROUGHEST)
 
 
 @wp.func
@@ -152,13 +153,12 @@ def judge(
     pads = wp.sqrt(wp.max(state.parameters[w, friction] * pad_friction, 1.0e-6))
     holds = 0.5 * heaviest * wp.length(gravity[w]) / pads
     handling.force_limit[w] = wp.where(force_limit > 0.0, force_limit, wp.max(LEAST_FORCE, MARGIN * holds))
-    before = roughness(handling, w, strain_limit)
     if not fresh[w]:
         handled = handling.handled
         handled[w, Handled.peak_force] = wp.max(handled[w, Handled.peak_force], handling.step_force[w])
         handled[w, Handled.peak_strain] = wp.max(handled[w, Handled.peak_strain], handling.step_strain[w])
     if gentle >= 0:
-        result.terms[w, gentle] = care * (before - roughness(handling, w, strain_limit))
+        result.terms[w, gentle] = -care * roughness(handling, w, strain_limit)
     if grasped(state, w):
         x = state.object_position[w, near]
         offset = wp.transform_point(wp.transform_inverse(tool), x)

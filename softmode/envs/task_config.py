@@ -97,8 +97,8 @@ class TaskConfig:
     force_limit: float | None = None
     """Largest contact force on it [N]; None for 15 N, or three times what holds its weight, if that is more."""
     care: float = 0.0
-    """What the reward loses for rough handling, of tasks with the term ``gentle``: this times how much the logarithm of
-    peak force or peak strain, whichever is nearer to its limit, rises beyond half of the limit."""
+    """What the reward of a step loses for rough handling, of tasks with the term ``gentle``: this times how far force
+    or strain in it, whichever is a larger share of its limit, is beyond half of the limit."""
     camera: CameraName = "front"
     """Camera of pixel observations: one in front of the table, or one on the hand."""
     image_size: int = 96

@@ -62,7 +62,9 @@ class Hyperparameters:
     min_std: float = 0.03
     """Lower bound of the standard deviation."""
     max_std: float = 1.0
-    """Upper bound of the standard deviation."""
+    """Upper bound of the standard deviation at the start of the run."""
+    final_std: float | None = None
+    """That at its end, to which it falls geometrically; it stays if omitted. Noise of a gripper is force."""
     bound: Literal["clamp", "tanh"] = "clamp"
     """How actions are kept in range: clamped on the way to the environment, or squashed."""
     normalize_observations: bool = True
@@ -95,6 +97,9 @@ class Hyperparameters:
             require_number("clip_value", self.clip_value, above=0.0, hint="give a number, or none")
         ok = self.min_std <= self.initial_std <= self.max_std
         _require("initial_std", self.initial_std, ok, f"from min_std {self.min_std} to max_std {self.max_std}")
+        if self.final_std is not None:
+            ok = self.min_std <= self.final_std <= self.max_std
+            _require("final_std", self.final_std, ok, f"from min_std {self.min_std} to max_std {self.max_std}")
         _require("hidden", self.hidden, all(_is_count(width) for width in self.hidden), "widths >= 1")
         hints = typing.get_type_hints(type(self))
         for name in ("schedule", "activation", "encoder", "bound"):

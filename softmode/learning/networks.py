@@ -123,15 +123,21 @@ class Actor(nn.Module):
         super().__init__()
         size = interface.action_size
         self.squash = options.bound == "tanh"
-        self.log_std_bounds = (math.log(options.min_std), math.log(options.max_std))
+        stds = (options.min_std, options.max_std, options.final_std or options.max_std)
+        self.log_std_bounds = [math.log(std) for std in stds]
         self.encoder = Encoder(interface, options)
         self.mean = mlp(self.encoder.size, options.hidden, size, options.activation, 0.01)
         self.log_std = nn.Parameter(torch.full((size,), math.log(options.initial_std)))
 
     @torch.no_grad()
-    def bound_std(self) -> None:
-        """Bring the standard deviation back into its range; to be called after every step of the optimizer."""
-        self.log_std.clamp_(*self.log_std_bounds)
+    def bound_std(self, progress: float) -> None:
+        """Bring the standard deviation back into its range; to be called after every step of the optimizer.
+
+        Args:
+            progress: How much of the run is over, 0 to 1.
+        """
+        low, high, last = self.log_std_bounds
+        self.log_std.clamp_(low, high + progress * (last - high))
 
     def to_action(self, sample: torch.Tensor) -> torch.Tensor:
         """Return the action in [-1, 1] of a sample of the Gaussian."""

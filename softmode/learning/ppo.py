@@ -96,7 +96,7 @@ class PPO:
                 if options.schedule == "adaptive" and train_actor:
                     optimizer.adapt(divergence, options.desired_kl, (MIN_LEARNING_RATE, options.max_learning_rate))
                 losses[4] = optimizer.step()
-                model.actor.bound_std()
+                model.actor.bound_std(progress)
                 sums += losses
         return sums / (options.epochs * min(options.minibatches, total))
 

@@ -209,6 +209,8 @@ class _Run:
         options = self.options
         path = options.init or options.run_dir
         check_env(start, path, options.env, self.env.interface)
+        if start.env_options != options.env_options:
+            self.report(f"{path} was trained with other options of the environment: {json.dumps(start.env_options)}")
         try:
             for name, module in self._modules().items():
                 arrays = {key: torch.from_numpy(array) for key, array in start.part(name).items()}

@@ -10,7 +10,7 @@ import pytest
 import warp as wp
 
 import softmode  # noqa: F401  (registers the environments)
-from softmode.envs.handling_kernels import DROP, LEAST_FORCE, MARGIN, principal_strain
+from softmode.envs.handling_kernels import DROP, GENTLE, LEAST_FORCE, MARGIN, ROUGHEST, principal_strain
 from softmode.envs.scripted import scripted_policy
 from softmode.envs.tasks.lift_soft.task import LiftSoftConfig, LiftSoftEnv
 from softmode.errors import ConfigError
@@ -123,24 +123,22 @@ def test_a_success_beyond_the_limit_is_not_safe() -> None:
     assert [value for value, _ in safe] == [True, False] and safe[0][1] == safe[1][1] > 3.0
 
 
-def test_care_costs_what_the_peaks_rise_by(lift: LiftSoftEnv) -> None:
-    """The sum of `gentle` is -care log(max(2 u, 1)), u the greater of the peaks relative to their limits, once a blow.
+def test_care_costs_what_is_beyond_half_of_a_limit(lift: LiftSoftEnv) -> None:
+    """A step's term is -care (u - 1/2), u the greater of force and strain relative to their limits, in blow and hold.
 
     Without care it is zero, and tasks without the term refuse it.
     """
-    care = 4.0
-    env = LiftSoftEnv(care=care)
-    for task in (env, lift):
-        total, costly = 0.0, 0
+    env = LiftSoftEnv(care=4.0)
+    for task, care in ((env, 4.0), (lift, 0.0)):
+        handling, costs = task.task.handling, []
         task.reset(seed=0, options={"position": (0.45, 0.0), "youngs_modulus": 1.0e6})
         for k in range(40):
             *_, info = task.step(DOWN if k < 25 else np.array([0.0, 0.0, 1.0, 0.0, -1.0], np.float32))
-            assert info["reward_terms"]["gentle"] <= 0.0
-            total, costly = total + info["reward_terms"]["gentle"], costly + (info["reward_terms"]["gentle"] < 0.0)
-        used = max(info["peak_force"] / task.task.handling.force_limit.numpy()[0], info["peak_strain"] / 0.3)
-        weight = care if task is env else 0.0
-        assert total == pytest.approx(-weight * np.log(2.0 * used), rel=1e-4) and used > 1.0
-        assert costly < 25
+            force, limit = handling.step_force.numpy()[0], handling.force_limit.numpy()[0]
+            used = max(force / limit, handling.step_strain.numpy()[0] / 0.3)
+            costs.append(np.clip(used - float(GENTLE), 0.0, float(ROUGHEST)))
+            assert info["reward_terms"]["gentle"] == pytest.approx(-care * costs[-1], rel=1e-4, abs=1e-5)
+        assert max(costs) > 1.0 and 0.0 in costs
     env.close()
     with pytest.raises(ConfigError, match="PressSoft has no term 'gentle'"):
         gym.make("softmode/PressSoft-v0", care=1.0)

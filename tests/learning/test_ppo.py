@@ -195,6 +195,18 @@ def test_presets_hold_for_every_number_of_worlds(count):
     assert Hyperparameters.from_json(options.to_json()) == options
 
 
+def test_the_bound_of_the_noise_falls_geometrically():
+    """Half-way through the run it is the root of both ends' product."""
+    from softmode.learning.networks import Actor
+    from softmode.learning.spaces import Interface
+
+    options = Hyperparameters(initial_std=0.8, max_std=0.8, final_std=0.2)
+    actor = Actor(Interface.of(PointVectorEnv(1)), options)
+    for progress, bound in ((0.0, 0.8), (0.5, 0.4), (1.0, 0.2)):
+        actor.bound_std(progress)
+        assert actor.log_std.exp().detach().numpy() == pytest.approx(bound, rel=1e-5)
+
+
 @pytest.mark.parametrize(
     "wrong",
     [
@@ -204,6 +216,7 @@ def test_presets_hold_for_every_number_of_worlds(count):
         {"hidden": (0,)},
         {"encoder": "resnet"},
         {"initial_std": 2.0},
+        {"final_std": 2.0},
         {"learning_rate": float("nan")},
         {"rollout_steps": True},
         {"clip_value": -1.0},
