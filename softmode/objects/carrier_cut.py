@@ -12,7 +12,6 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from softmode.objects.carriers import (
-    DOUBTED,
     LIKELY,
     SURE,
     WIDE,
@@ -25,7 +24,7 @@ from softmode.objects.carriers import (
     heavy,
     weighted_median,
 )
-from softmode.objects.hands import find_arm
+from softmode.objects.hands import HELD, find_arm
 from softmode.splats.components import disc_points, link_labels, size_of
 from softmode.splats.splats import Splats
 
@@ -194,7 +193,7 @@ class Pieces:
     def told(self) -> dict[str, str | int | float]:
         """What a report says of a hand that holds it, of the carrier, and of what may be one or may be none."""
         told = self._carrier_told if self.cuts else {}
-        if self.arm <= DOUBTED:
+        if self.arm < HELD:
             return told
         every = " ".join(map(str, range(1, self.count + 1)))
         held = {

@@ -18,6 +18,8 @@ Array = NDArray[np.float64]
 
 WAYS = 60
 """Directions in which ends are looked for."""
+HELD = 0.3
+"""Score from which on a hand is named."""
 LOOK, APART, CELL = 0.25, 0.12, 0.015
 """What is looked at behind an end, how far ends are apart, and edge of the cells, over the size of the whole."""
 
@@ -69,12 +71,12 @@ def _open_tube(points: Array, normals: Array, near: NDArray[np.intp], end: Array
     wide: Any = np.ptp(np.quantile(rest, [0.02, 0.98], axis=0), axis=0).max()
     why = {
         "tube": ramp(-float(value[0]), -0.12, -0.05),
-        "around": ramp(float((ring > 0).mean()), 0.7, 0.9),
+        "around": ramp(float((ring > 0).mean()), 0.65, 0.85),
         "open": ramp(-across_end * (CELL * size) ** 2 / (np.pi * (0.5 * radius) ** 2), -0.3, -0.1),
         "slim": ramp(radius / size, 0.03, 0.05) * ramp(-radius / size, -0.2, -0.16),
         "long": ramp(length / radius, 1.4, 2.0),
         "beside": ramp(float(wide) / (2.0 * radius), 1.3, 1.8),
         # What points down may be a leg or a plinth, whose underside was not seen.
-        "up": ramp(float(axis[2]), -0.9, -0.8),
+        "up": ramp(float(axis[2]), -0.8, -0.65),
     }
     return float(np.prod(list(why.values())))
