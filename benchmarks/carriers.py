@@ -1,7 +1,7 @@
 """The object of made captures: what is taken of it, of its carrier, and whether the report says what is doubtful.
 
-Run with `python -m benchmarks.carriers [smooth rough bare room held] [--seeds 4800 --count 40] [--fill]`. Shares are of the
-splats of each label, volumes are those of the fill over the truth, times are processor time of one core.
+Run with `python -m benchmarks.carriers [smooth rough bare room held] [--seeds 4800 --count 40] [--fill]`. Shares are of
+the splats of each label, volumes are those of the fill over the truth, times are processor time of one core.
 """
 
 from __future__ import annotations

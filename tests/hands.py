@@ -1,4 +1,7 @@
-"""Captures made by code in which a hand holds a toy: grips, sleeves, and ends as a crop or the photographs leave them."""
+"""Captures made by code in which hands hold a toy: grips, sleeves, arms that end as a crop or photographs leave them.
+
+A check that looks at colours would be easy on them: arms have one colour, toys have many.
+"""
 
 from __future__ import annotations
 

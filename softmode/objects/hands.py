@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.deformables.quadrature.shell_views import spread_samples
+from softmode.deformables.quadrature.shell_views import even_directions, spread_samples
 from softmode.objects.carriers import Surface, ramp
 
 Array = NDArray[np.float64]
@@ -36,12 +36,9 @@ def find_arm(surface: Surface) -> tuple[float, Array]:
     cell = np.floor((sample - sample.min(axis=0)) / (CELL * size)).astype(np.int64)
     first = np.unique(cell @ (1, 2**20, 2**40), return_index=True)[1]
     points, normals = sample[first], surface.normals[owner[first]]
-    k = np.arange(WAYS) + 0.5
-    polar, azimuth = np.arccos(1.0 - 2.0 * k / WAYS), np.pi * (1.0 + np.sqrt(5.0)) * k
-    ways = np.stack([np.cos(azimuth) * np.sin(polar), np.sin(azimuth) * np.sin(polar), np.cos(polar)])
     few = min(20, len(points))  # floaters lie beyond
     ends, best = np.zeros((0, 3)), (0.0, np.zeros(3))
-    for end in points[np.argpartition(points @ ways, -few, axis=0)[-few]]:
+    for end in points[np.argpartition(points @ even_directions(WAYS).T, -few, axis=0)[-few]]:
         if (np.linalg.norm(ends - end, axis=1) > APART * size).all():
             ends = np.append(ends, [end], axis=0)
             near = np.flatnonzero(((points - end) ** 2).sum(axis=1) < (LOOK * size) ** 2)

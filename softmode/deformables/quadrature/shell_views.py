@@ -61,6 +61,13 @@ def spread_samples(mean: Array, tangent: Array, voxel: float) -> tuple[Array, ND
     return np.concatenate(position), np.concatenate(owner)
 
 
+def even_directions(count: int) -> Array:
+    """Return unit vectors (count, 3) spread evenly, on a spiral."""
+    k = np.arange(count) + 0.5
+    polar, azimuth = np.arccos(1.0 - 2.0 * k / count), np.pi * (1.0 + np.sqrt(5.0)) * k
+    return np.stack([np.cos(azimuth) * np.sin(polar), np.sin(azimuth) * np.sin(polar), np.cos(polar)], axis=1)
+
+
 def orient(
     mean: Array, normal: Array, tangent: Array, nearest: NDArray[np.intp], pixel: float
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
@@ -80,14 +87,11 @@ def orient(
         Sign per splat that turns its normal outside, confidence 0..1 per splat, and whether it is seen at all.
     """
     sample, owner = spread_samples(mean, DISC * tangent, pixel)
-    k = np.arange(VIEW_COUNT) + 0.5
-    polar, azimuth = np.arccos(1.0 - 2.0 * k / VIEW_COUNT), np.pi * (1.0 + np.sqrt(5.0)) * k
-    toward = np.stack([np.cos(azimuth) * np.sin(polar), np.sin(azimuth) * np.sin(polar), np.cos(polar)], axis=1)
     vote, most, views = np.zeros(len(mean)), np.zeros(len(mean)), np.zeros(len(mean), dtype=int)
     cell, discs = 1.5 * pixel, np.bincount(owner, minlength=len(mean))
     place = np.ascontiguousarray(((sample - mean.mean(axis=0)) / cell).T, dtype=np.float32)
     half = int(np.sqrt((place**2).sum(axis=0).max())) + 2
-    for direction in toward:
+    for direction in even_directions(VIEW_COUNT):
         helper = np.eye(3)[np.abs(direction).argmin()]
         right = np.cross(direction, helper)
         right /= np.linalg.norm(right)
