@@ -145,19 +145,24 @@ def _outline(hull: ConvexHull, count: int) -> Array:
     return np.stack([np.interp(np.linspace(0.0, along[-1], count, endpoint=False), along, x) for x in corners.T])
 
 
-def dilated(masks: Mask, disc: Mask) -> Mask:
-    """Return the cells of layers (..., A, B) within a disc of others."""
+def dilated(masks: Mask, disc: Mask, *, beyond: bool = False) -> Mask:
+    """Return the cells of layers (..., A, B) within a disc of others, or of what is beyond the layers."""
     (a, b), r = masks.shape[-2:], len(disc) // 2
-    wide = np.pad(masks, [(0, 0)] * (masks.ndim - 2) + [(r, r)] * 2)
+    wide = np.pad(masks, [(0, 0)] * (masks.ndim - 2) + [(r, r)] * 2, constant_values=beyond)
     found = np.zeros_like(masks)
     for i, j in np.argwhere(disc):
         found |= wide[..., i : i + a, j : j + b]
     return found
 
 
+def eroded(masks: Mask, disc: Mask) -> Mask:
+    """Return the cells of layers (..., A, B) that have a disc of others around them."""
+    return ~dilated(~masks, disc, beyond=True)
+
+
 def closed(masks: Mask, disc: Mask) -> Mask:
     """Return cells of layers (..., A, B) with what is narrower than a disc between them."""
-    return ~dilated(~dilated(masks, disc), disc)
+    return eroded(dilated(masks, disc), disc)
 
 
 def filled(masks: Mask) -> Mask:
@@ -221,7 +226,7 @@ class Sections:
         shell[k, i, j] = True
         self.level[k[flat], i[flat], j[flat]] = True
         shell[1:] |= shell[:-1].copy()
-        whole = ~dilated(~filled(dilated(shell, DISC)), DISC)
+        whole = eroded(filled(dilated(shell, DISC)), DISC)
         square = whole[:, 1:] & whole[:, :-1]
         square = square[:, :, 1:] & square[:, :, :-1]
         self.solid = np.zeros_like(shell)
