@@ -217,9 +217,9 @@ class Sections:
         wide = np.ceil((high[:2] - self.origin[:2]) / self.cell).astype(int) + 6
         count = int(np.ceil((z1 - z0) / self.layer)) + 1
         sample, owner = spread_samples(x, 1.5 * self.surface.tangents, 0.7 * self.cell)
-        index = np.floor((sample - self.origin) / [self.cell, self.cell, self.layer]).astype(int)
-        good = ((index >= 0) & (index < (*wide, count))).all(axis=1)
-        (i, j, k), flat = index[good].T, np.abs(self.surface.normals[owner[good], 2]) > 0.85
+        index = np.floor((sample - self.origin) / [self.cell, self.cell, self.layer]).astype(int).T
+        good = np.logical_and.reduce([(0 <= at) & (at < n) for at, n in zip(index, (*wide, count), strict=True)])
+        (i, j, k), flat = index[:, good], (np.abs(self.surface.normals[:, 2]) > 0.85)[owner[good]]
         shell = np.zeros((count, *wide), dtype=bool)
         self.level = shell.copy()
         """Where splats lie level, within 32 degrees, shape (layers, cells, cells)."""

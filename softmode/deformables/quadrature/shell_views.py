@@ -50,8 +50,9 @@ def spread_samples(mean: Array, tangent: Array, voxel: float) -> tuple[Array, ND
     """Cover each splat's disc, as wide as its tangents, with samples a voxel apart; return them and their splat."""
     steps = np.clip(np.ceil(2.0 * np.linalg.norm(tangent, axis=1) / voxel), 1, 9).astype(int)
     position, owner = [], []
-    for a, b in np.unique(steps, axis=0):
-        member = np.flatnonzero((steps == (a, b)).all(axis=1))
+    size = 10 * steps[:, 0] + steps[:, 1]
+    for a, b in (divmod(int(key), 10) for key in np.unique(size)):
+        member = np.flatnonzero(size == 10 * a + b)
         u, v = ((np.arange(k) + 0.5) * (2.0 / k) - 1.0 for k in (a, b))
         u, v = (g.ravel() for g in np.meshgrid(u, v, indexing="ij"))
         keep = (u * u + v * v) <= 1.0 if a > 2 and b > 2 else np.ones(len(u), dtype=bool)
