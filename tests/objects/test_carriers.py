@@ -9,13 +9,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from benchmarks.carriers import MADE, SEEDS, judge
 from softmode.deformables.quadrature.quadrature import quadrature_from_splats
 from softmode.errors import AssetError, ConfigError
 from softmode.objects import ObjectConfig
-from softmode.objects.carriers import SURE
+from softmode.objects.carriers import DISC, SURE, WIDE, closed, eroded, filled
 from softmode.objects.parts import choose_part, find_ground
 from softmode.objects.pipeline import standing_quadrature
 from softmode.objects.source import object_source
@@ -37,6 +38,7 @@ def test_object_is_taken_without_its_carrier_and_closed() -> None:
     assert part.count == kept.sum() + choice.told["floor_splats"]
     found = quadrature_from_splats(part.means, part.scales, part.quats, part.opacities, resolution=64)
     assert found.volume == pytest.approx(made.volume, rel=0.03)
+    assert "doubt" not in choice.told  # its lower step is climbed for sure
     assert float(choice.told["carrier_score"]) > 0.85 and int(choice.told["carrier_splats"]) > 0
     numbers = tuple(map(int, str(choice.told["carrier_part"]).split()))
     whole = choose_part(made.splats, numbers)
@@ -44,6 +46,15 @@ def test_object_is_taken_without_its_carrier_and_closed() -> None:
     below = choose_part(made.splats, (numbers[-1],))
     assert np.isin(below.number, below.taken)[made.label == OBJECT].mean() < 0.03
     assert int(below.told["floor_splats"]) > 0  # a lid
+
+
+def test_layers_are_closed_and_filled_like_single_ones() -> None:
+    """What is done to a stack of layers at once is what `scipy.ndimage` does to each, also at the border."""
+    layers = ndimage.gaussian_filter(np.random.default_rng(0).normal(size=(4, 40, 50)), (0, 2, 2)) > 0.1
+    for one, mask in enumerate(layers):
+        np.testing.assert_array_equal(eroded(layers, DISC)[one], ndimage.binary_erosion(mask, DISC))
+        np.testing.assert_array_equal(closed(layers, WIDE)[one], ndimage.binary_closing(mask, WIDE))
+        np.testing.assert_array_equal(filled(layers)[one], ndimage.binary_fill_holes(mask))
 
 
 def test_a_block_with_a_handle_stays_whole() -> None:
