@@ -19,6 +19,7 @@ from softmode.objects.carriers import (
     Sections,
     Surface,
     best_axis,
+    dilated,
     filled,
     find_boundaries,
     heavy,
@@ -92,7 +93,7 @@ def cut_at(sections: Sections, boundary: Boundary, gap: float) -> Cut:
         lying = (lying & ~(core[i, j] & (height > 0.3 * reach))) | sheet
         foot, stands = np.zeros_like(contact), above & ~sheet & (height < 2.0 * span)
         foot[i[stands], j[stands]] = True
-        contact = contact & filled(ndimage.binary_dilation(foot, WIDE))
+        contact = contact & filled(dilated(foot, WIDE))
     above &= ~lying
     kept = np.flatnonzero(above)
     if len(kept) > 50:
