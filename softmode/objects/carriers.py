@@ -306,7 +306,7 @@ class Sections:
         for k in range(reach + 2, len(self.solid) - reach - 2):
             under = self.solid[max(0, k - reach - 2) : k - reach + 1].any(axis=0)
             above = self.solid[k + reach : k + reach + 3].sum(axis=0) >= 2
-            level: Any = self.level[k - reach : k + reach + 1].any(axis=0) & ~above
+            level = np.asarray(self.level[k - reach : k + reach + 1].any(axis=0) & ~above)
             if not above.any() or bulk[k] < 0.03 * bulk[0] or level.sum() < 0.05 * (under & ~above).sum():
                 continue
             below = filled(closed(under, WIDE))
