@@ -304,9 +304,9 @@ class Sections:
         """Return heights with more below than above: layer, outline below, cells free, and their level share."""
         found, bulk = [], np.cumsum(self.areas[::-1])[::-1]
         for k in range(reach + 2, len(self.solid) - reach - 2):
-            under = self.solid[max(0, k - reach - 2) : k - reach + 1].any(axis=0)
+            under = np.asarray(self.solid[max(0, k - reach - 2) : k - reach + 1].any(axis=0))
             above = self.solid[k + reach : k + reach + 3].sum(axis=0) >= 2
-            level = np.asarray(self.level[k - reach : k + reach + 1].any(axis=0) & ~above)
+            level = self.level[k - reach : k + reach + 1].any(axis=0) & ~above
             if not above.any() or bulk[k] < 0.03 * bulk[0] or level.sum() < 0.05 * (under & ~above).sum():
                 continue
             below = filled(closed(under, WIDE))
