@@ -1,7 +1,7 @@
 """The object of made captures: what is taken of it, of its carrier, and whether the report says what is doubtful.
 
-Run with `python -m benchmarks.carriers [smooth rough bare room] [--seeds 4800 --count 40] [--fill]`. Shares are of the
-splats of each label, volumes are those of the fill over the truth, times are processor time of one core.
+Run with `python -m benchmarks.carriers [smooth rough bare room held] [--seeds 4800 --count 40] [--fill]`. Shares are of
+the splats of each label, volumes are those of the fill over the truth, times are processor time of one core.
 """
 
 from __future__ import annotations
@@ -15,10 +15,14 @@ import numpy as np
 
 from softmode.deformables.quadrature.quadrature import quadrature_from_splats
 from softmode.errors import AssetError
+from softmode.objects.carriers import SURE
 from softmode.objects.parts import choose_part
 from tests.carriers import CARRIER, OBJECT, SETS, Made
+from tests.hands import held
 
-SEEDS = {"smooth": (6000, 40), "rough": (6100, 10), "bare": (6200, 20), "room": (6300, 4)}
+MADE = {**SETS, "held": held}
+"""Captures by seed."""
+SEEDS = {"smooth": (6000, 40), "rough": (6100, 10), "bare": (6200, 20), "room": (6300, 4), "held": (6400, 12)}
 """First seed and number of captures of each set, chosen after the code was done."""
 
 
@@ -30,7 +34,7 @@ class Verdict:
     carrier_share: float
     right: bool
     """At least 97 % (rough: 95 %) of the object's splats and at most 1 % (3 %) of the carrier's; a bare thing uncut; a
-    room named."""
+    room named; what a hand holds refused, and nothing else."""
     doubted: bool
     """Whether a doubt was named."""
     option: str
@@ -71,6 +75,8 @@ def judge(made: Made, kind: str, *, fill: bool = False) -> Verdict:
     right = good(choice.taken) and (made.carried or "carrier" not in choice.told)
     if kind == "room":
         right = "scene_crop" in choice.told
+    arm = float(choice.told.get("arm", 0.0))
+    right = arm > SURE if kind == "held" else right and arm <= SURE
     volume = float("nan")
     if fill:
         part = choice.part
@@ -86,7 +92,7 @@ def judge(made: Made, kind: str, *, fill: bool = False) -> Verdict:
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("sets", nargs="*", default=list(SETS))
+    parser.add_argument("sets", nargs="*", default=list(MADE))
     parser.add_argument("--seeds", type=int, help="first seed")
     parser.add_argument("--count", type=int, help="number of captures")
     parser.add_argument("--fill", action="store_true", help="fill what is taken, for the volume")
@@ -96,7 +102,7 @@ def main() -> None:
         first, count = options.seeds or first, options.count or count
         found, splats = [], 0
         for seed in range(first, first + count):
-            made = SETS[kind](seed)
+            made = MADE[kind](seed)
             found.append(judge(made, kind, fill=options.fill))
             splats += made.splats.count
             print(f"{kind:7}{seed:6d} {made.name:22}{made.splats.count:7d} {found[-1].line}", flush=True)

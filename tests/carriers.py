@@ -54,7 +54,12 @@ class Solid:
 
     def holds(self, points: Array) -> NDArray[np.bool_]:
         """Return which points (N, 3) lie in it."""
-        return self.inside((points - self.at) @ self.turn)
+        local = (points - self.at) @ self.turn
+        low, high = np.asarray(self.mesh.bounds)
+        near = (np.abs(2.0 * local - low - high) < 1.1 * (high - low)).all(axis=1)
+        found = np.zeros(len(points), dtype=bool)
+        found[near] = self.inside(local[near])
+        return found
 
     @property
     def corners(self) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,11 +19,13 @@ from softmode.objects.carriers import (
     Sections,
     Surface,
     best_axis,
+    dilated,
     filled,
     find_boundaries,
     heavy,
     weighted_median,
 )
+from softmode.objects.hands import HELD, find_arm
 from softmode.splats.components import disc_points, link_labels, size_of
 from softmode.splats.splats import Splats
 
@@ -91,7 +93,7 @@ def cut_at(sections: Sections, boundary: Boundary, gap: float) -> Cut:
         lying = (lying & ~(core[i, j] & (height > 0.3 * reach))) | sheet
         foot, stands = np.zeros_like(contact), above & ~sheet & (height < 2.0 * span)
         foot[i[stands], j[stands]] = True
-        contact = contact & filled(ndimage.binary_dilation(foot, WIDE))
+        contact = contact & filled(dilated(foot, WIDE))
     above &= ~lying
     kept = np.flatnonzero(above)
     if len(kept) > 50:
@@ -158,6 +160,10 @@ class Pieces:
     """What is there."""
     top: int
     """The pieces from the first to this one are the object, the others carry it."""
+    arm: float = 0.0
+    """How sure it is that a hand holds it, 0 to 1."""
+    end: str = ""
+    """Where the arm ends."""
 
     @property
     def count(self) -> int:
@@ -186,9 +192,22 @@ class Pieces:
 
     @property
     def told(self) -> dict[str, str | int | float]:
-        """What a report says of the carrier, and of what may be one or may be none."""
-        if not self.cuts:
-            return {}
+        """What a report says of a hand that holds it, of the carrier, and of what may be one or may be none."""
+        told = self._carrier_told if self.cuts else {}
+        if self.arm < HELD:
+            return told
+        every = " ".join(map(str, range(1, self.count + 1)))
+        held = {
+            "doubt": f"a hand seems to hold it: an arm reaches out of it and ends open at {self.end}",
+            "doubt_remedy": f"capture it as it stands, or crop the hand away (softmode view --prepare); --part {every}"
+            " takes all of it",
+        }
+        if "doubt" in told:
+            held = {name: f"{what}; {told[name]}" for name, what in held.items()}
+        return told | held | {"arm": self.arm}
+
+    @property
+    def _carrier_told(self) -> dict[str, str | int | float]:
         options = [" ".join(map(str, range(1, last + 1))) for last in range(1, self.count + 1)]
         heights = [float(cut.floor[:, 2].mean()) for cut in self.cuts]
         scores = [boundary.score for boundary in self.boundaries]
@@ -234,11 +253,13 @@ def divide(thing: Splats, normal: Array | None, gap: float) -> Pieces:
     if len(solid) < 500:
         return WHOLE
     surface = Surface.of(thing.subset(solid))
+    arm, end = find_arm(surface)
+    held: dict[str, Any] = {"arm": arm, "end": " ".join(f"{x:.3g}" for x in end + thing.offset)}
     axis = best_axis(surface, np.array([0.0, 0.0, 1.0])) if normal is None else normal
     sections = Sections(surface, axis)
     found, chosen = find_boundaries(sections)
     if not found:
-        return WHOLE
+        return replace(WHOLE, **held)
     ranked = sorted(found, key=lambda boundary: -boundary.score - 2.0 * (boundary is chosen))[: PIECES - 1]
     ranked.sort(key=lambda boundary: -boundary.height)
     cuts = [cut_at(sections, boundary, gap) for boundary in ranked]
@@ -249,4 +270,4 @@ def divide(thing: Splats, normal: Array | None, gap: float) -> Pieces:
     every = np.where(away < 0.5 * gap, number[nearest], 0)
     every[solid] = number
     top = next((k for k, boundary in enumerate(ranked, start=1) if boundary is chosen), len(cuts) + 1)
-    return Pieces(number=every, cuts=tuple(cuts), boundaries=tuple(ranked), top=top)
+    return Pieces(number=every, cuts=tuple(cuts), boundaries=tuple(ranked), top=top, **held)

@@ -145,9 +145,37 @@ def _outline(hull: ConvexHull, count: int) -> Array:
     return np.stack([np.interp(np.linspace(0.0, along[-1], count, endpoint=False), along, x) for x in corners.T])
 
 
-def filled(mask: Any) -> Mask:
-    """Return cells with the holes between them."""
-    return np.asarray(ndimage.binary_fill_holes(mask))
+def dilated(masks: Mask, disc: Mask, *, beyond: bool = False) -> Mask:
+    """Return the cells of layers (..., A, B) within a disc of others, or of what is beyond the layers."""
+    (a, b), r = masks.shape[-2:], len(disc) // 2
+    wide = np.pad(masks, [(0, 0)] * (masks.ndim - 2) + [(r, r)] * 2, constant_values=beyond)
+    found = np.zeros_like(masks)
+    for i, j in np.argwhere(disc):
+        found |= wide[..., i : i + a, j : j + b]
+    return found
+
+
+def eroded(masks: Mask, disc: Mask) -> Mask:
+    """Return the cells of layers (..., A, B) that have a disc of others around them."""
+    return ~dilated(~masks, disc, beyond=True)
+
+
+def closed(masks: Mask, disc: Mask) -> Mask:
+    """Return cells of layers (..., A, B) with what is narrower than a disc between them."""
+    return eroded(dilated(masks, disc), disc)
+
+
+def filled(masks: Mask) -> Mask:
+    """Return cells of layers (..., A, B) with the holes between them."""
+    layers = masks.reshape(-1, *masks.shape[-2:])
+    cross = np.zeros((3, 3, 3), dtype=bool)
+    cross[1] = ndimage.generate_binary_structure(2, 1)
+    labelled: Any = ndimage.label(~layers, cross)
+    label, outside = labelled[0], np.zeros(labelled[1] + 1, dtype=bool)
+    for edge in (label[:, 0], label[:, -1], label[:, :, 0], label[:, :, -1]):
+        outside[edge] = True
+    outside[0] = False
+    return ~outside[label].reshape(masks.shape)
 
 
 def heavy(solid: Mask) -> Mask:
@@ -189,19 +217,22 @@ class Sections:
         wide = np.ceil((high[:2] - self.origin[:2]) / self.cell).astype(int) + 6
         count = int(np.ceil((z1 - z0) / self.layer)) + 1
         sample, owner = spread_samples(x, 1.5 * self.surface.tangents, 0.7 * self.cell)
-        index = np.floor((sample - self.origin) / [self.cell, self.cell, self.layer]).astype(int)
-        good = ((index >= 0) & (index < (*wide, count))).all(axis=1)
-        (i, j, k), flat = index[good].T, np.abs(self.surface.normals[owner[good], 2]) > 0.85
+        index = np.floor((sample - self.origin) / [self.cell, self.cell, self.layer]).astype(int).T
+        good = np.logical_and.reduce([(0 <= at) & (at < n) for at, n in zip(index, (*wide, count), strict=True)])
+        (i, j, k), flat = index[:, good], (np.abs(self.surface.normals[:, 2]) > 0.85)[owner[good]]
         shell = np.zeros((count, *wide), dtype=bool)
         self.level = shell.copy()
         """Where splats lie level, within 32 degrees, shape (layers, cells, cells)."""
         shell[k, i, j] = True
         self.level[k[flat], i[flat], j[flat]] = True
+        shell[1:] |= shell[:-1].copy()
+        whole = eroded(filled(dilated(shell, DISC)), DISC)
+        square = whole[:, 1:] & whole[:, :-1]
+        square = square[:, :, 1:] & square[:, :, :-1]
         self.solid = np.zeros_like(shell)
         """The sections, shape (layers, cells, cells)."""
-        for k in range(count):
-            two = ndimage.binary_dilation(shell[max(0, k - 1) : k + 1].any(axis=0), DISC)
-            self.solid[k] = ndimage.binary_opening(ndimage.binary_erosion(filled(two), DISC), np.ones((2, 2)))
+        for i, j in np.ndindex(2, 2):
+            self.solid[:, i : i + square.shape[1], j : j + square.shape[2]] |= square
         cells = self.solid.sum(axis=(1, 2))
         self.areas = cells * self.cell**2
         """Areas of the sections, shape (layers,)."""
@@ -273,19 +304,18 @@ class Sections:
         """Return heights with more below than above: layer, outline below, cells free, and their level share."""
         found, bulk = [], np.cumsum(self.areas[::-1])[::-1]
         for k in range(reach + 2, len(self.solid) - reach - 2):
-            under = self.solid[max(0, k - reach - 2) : k - reach + 1].any(axis=0)
+            under = np.asarray(self.solid[max(0, k - reach - 2) : k - reach + 1].any(axis=0))
             above = self.solid[k + reach : k + reach + 3].sum(axis=0) >= 2
             level = self.level[k - reach : k + reach + 1].any(axis=0) & ~above
             if not above.any() or bulk[k] < 0.03 * bulk[0] or level.sum() < 0.05 * (under & ~above).sum():
                 continue
-            below = filled(ndimage.binary_closing(under, WIDE))
+            below = filled(closed(under, WIDE))
             if below.sum() < 1.1 * above.sum():
                 continue
-            beside: Any = ndimage.binary_dilation(above, DISC)
-            free = below & ~beside
+            free = below & ~dilated(above, DISC)
             if free.sum() < 20:
                 continue
-            cover = float((ndimage.binary_closing(level, DISC) & free).sum() / free.sum())
+            cover = float((closed(level, DISC) & free).sum() / free.sum())
             found.append((k, below, int(free.sum()), cover))
         return found
 
@@ -332,7 +362,7 @@ class Sections:
         unsure = plain_above > 0.9 or above.sum() < 0.03 * below.sum()
         score = min(float(np.prod(list(why.values()))), 0.99 * SURE if unsure else 1.0)
         if score < LIKELY and np.prod([part for name, part in why.items() if name != "free"]) > 0.9:
-            score = max(score, 1.5 * DOUBTED * ramp(around + 0.3 * contrast, 0.55, 0.65))  # all else speaks for it
+            score = max(score, 1.5 * DOUBTED * ramp(around + 0.3 * contrast, 0.65, 0.7))  # all else speaks for it
         named = {"convexity": convex, "plain_above": plain_above}
         top = Boundary(kind="top", height=float(self.heights[k]), score=score, contact=above, reach=reach, **named)
         return [top]
@@ -366,10 +396,11 @@ class Sections:
         return sorted(found, key=lambda stem: -stem.score)[:1]
 
 
-def is_step(sections: Sections, lower: Boundary, upper: Boundary) -> bool:
-    """Return whether what lies between two boundaries belongs to the carrier: convex, plain, plainer than what follows.
+def is_step(sections: Sections, lower: Boundary, upper: Boundary) -> tuple[bool, bool]:
+    """Return whether what lies between two boundaries belongs to the carrier, and whether there is no doubt about it.
 
-    So neither shoulders nor the hood of a car are climbed.
+    It does if it is convex, plain, and plainer than what follows: so neither shoulders nor the hood of a car are
+    climbed.
     """
     first, last = sections.layer_of(lower.height), sections.layer_of(upper.height)
     between = [convexity(mask) for mask in sections.solid[first + 3 : last - 2] if mask.any()]
@@ -377,20 +408,26 @@ def is_step(sections: Sections, lower: Boundary, upper: Boundary) -> bool:
     if last - first < 0.25 * len(sections.solid):  # the faces of a low step may be too bare for sections
         convex = max(convex, upper.convexity)
     plain, _, _ = sections.look(lower.height + sections.layer, upper.height + sections.layer)
-    return convex > 0.8 and plain > 0.6 and plain - upper.plain_above > 0.15
+    plainer = plain - upper.plain_above
+    if convex > 0.8 and plain > 0.6 and plainer > 0.15:
+        return True, convex > 0.85 and plain > 0.7 and plainer > 0.3
+    return False, convex < 0.65 or plain < 0.45 or (plain < 0.8 and plainer < 0.1)
 
 
 def find_boundaries(sections: Sections) -> tuple[list[Boundary], Boundary | None]:
     """Return the heights at which a carrier may end, upwards, and the one at which it does; None where nothing carries.
 
-    From the lowest carrier it goes upwards over its steps.
+    From the lowest carrier it goes upwards over its steps. Heights at which it surely does not end are left out.
     """
     found = [top for top in (*sections.tops(), *sections.stem()) if top.score > DOUBTED]
     found.sort(key=lambda boundary: boundary.height)
     chosen: Boundary | None = None
-    for boundary in found:
-        if boundary.score < LIKELY:
-            continue
-        if chosen is None or boundary.kind == "stem" or is_step(sections, chosen, boundary):
-            chosen = boundary
-    return found, chosen
+    passed: list[Boundary] = []
+    for boundary in (one for one in found if one.score >= LIKELY):
+        climbs, sure = True, False
+        if chosen is not None and boundary.kind == "top":
+            climbs, sure = is_step(sections, chosen, boundary)
+            if sure:
+                passed.append(chosen if climbs else boundary)
+        chosen = boundary if climbs else chosen
+    return [boundary for boundary in found if boundary not in passed], chosen

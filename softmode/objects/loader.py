@@ -23,7 +23,7 @@ from softmode.objects.config import ObjectConfig
 from softmode.objects.object_file import file_kind, read_object, surface_cover
 from softmode.objects.pipeline import body_key, build_standing, dressed
 from softmode.objects.shapes.presets import PRESETS
-from softmode.objects.soft_object import SoftObject
+from softmode.objects.soft_object import KEPT_FROM, SoftObject
 from softmode.objects.source import ObjectSource, object_source
 from softmode.radiance.grid import RadianceGrid
 from softmode.splats.colored_mesh import ColoredMesh
@@ -37,6 +37,9 @@ if TYPE_CHECKING:
     """What can be loaded beside a file."""
 
 Progress = Callable[[str, float], None] | bool | None
+
+AVERAGES = 0.15
+"""Share of the time in which averages over many splats are made; the rest goes into the body."""
 _IN_MEMORY: dict[type, str] = {Splats: "splat", RadianceGrid: "radiance", ColoredMesh: "mesh"}
 """Which option of a configuration takes what has been read."""
 
@@ -56,7 +59,8 @@ def load(
             field; a body; splats, a field or a mesh (also of trimesh) in memory; None for the built-in plush.
         material: What it is made of; None for what its file or preset says. The body is built for its Poisson's ratio,
             unless `BuildOptions` name one.
-        progress: Passed to :func:`softmode.deformables.reduction.build_body.build_body`.
+        progress: Passed to :func:`softmode.deformables.reduction.build_body.build_body`. A callable is also told of
+            averages over many splats, which are then made here.
         options: Fields of `ObjectConfig`, such as ``size=0.08``; they replace those of a configuration. A body takes
             only ``contact_radius``.
 
@@ -86,8 +90,17 @@ def load(
             config=config,
         )
     parts, material, made = _read(config, material)
-    body = cached_body(body_key(made, parts), lambda: build_standing(made, parts, progress=progress)[0])
-    return dressed(body, config, parts, material)
+    if not callable(progress) or parts.splats.count < KEPT_FROM:
+        body = cached_body(body_key(made, parts), lambda: build_standing(made, parts, progress=progress)[0])
+        return dressed(body, config, parts, material)
+    tell, share = progress, 1.0 - AVERAGES
+    body = cached_body(
+        body_key(made, parts),
+        lambda: build_standing(made, parts, progress=lambda name, done: tell(name, share * done))[0],
+    )
+    found = dressed(body, config, parts, material)
+    found.average(lambda done: tell("averaging functions over splats", share + AVERAGES * done))
+    return found
 
 
 def build_object(

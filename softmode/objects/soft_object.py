@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -131,12 +132,23 @@ class SoftObject:
 
     @cached_property
     def _averages(self) -> tuple[Array, Array]:
+        return self._averaged(lambda share: None)
+
+    def average(self, progress: Callable[[float], None]) -> None:
+        """Average the functions over the splats now, and not where `basis` is first read.
+
+        Args:
+            progress: Told which share of the splats is done, 0 to 1.
+        """
+        self.__dict__["_averages"] = self._averaged(progress)
+
+    def _averaged(self, progress: Callable[[float], None]) -> tuple[Array, Array]:
         body, splats = self.body, self.visible_splats
         means, covariances = splats.means, splats.covariances()
 
         def make() -> tuple[Array, Array]:
             with stage(f"averaging functions over {splats.count} splats"):
-                return average_basis(body, means, covariances)
+                return average_basis(body, means, covariances, progress=progress)
 
         def read(path: Path) -> tuple[Array, Array]:
             found = read_archive(path, "softmode.averages", 1)[1]

@@ -19,6 +19,7 @@ from softmode.deformables.reduction.cache import cached
 from softmode.errors import AssetError, ConfigError
 from softmode.files import read_archive, write_archive
 from softmode.foreign import tokens
+from softmode.objects.carriers import SURE
 from softmode.objects.config import SIZE, ObjectConfig
 from softmode.objects.mesh_file import read_mesh
 from softmode.objects.parts import choose_part
@@ -224,6 +225,8 @@ def _upright_splats(
         with stage("finding the object in the capture"):
             choice = choose_part(cropped, config.part)
         splats, stray, given, capture = choice.part, 0.002, cropped.count, dict(choice.told)
+        if float(choice.told.get("arm", 0.0)) > SURE:
+            raise AssetError(f"{name}: {choice.told['doubt']}", hint=str(choice.told["doubt_remedy"]))
     bounds = splats.bounds(quantile=stray)
     extent = float(np.ptp(bounds, axis=0).max())
     if not extent > 0.0:

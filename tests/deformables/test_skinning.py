@@ -279,7 +279,9 @@ def test_averages_of_many_splats_are_those_of_each(monkeypatch: pytest.MonkeyPat
     functions = SimpleNamespace(values=values, evaluate=evaluate, narrow=2e-3)
     each = average_basis(functions, means, covariances)
     monkeypatch.setattr(averages, "MANY", 500)
-    grid = average_basis(functions, means, covariances)
+    shares: list[float] = []
+    grid = average_basis(functions, means, covariances, progress=shares.append)
+    assert shares == sorted(shares) and shares[-1] == 1.0
     np.testing.assert_allclose(grid[0][:, :2], each[0][:, :2], atol=1e-7)
     np.testing.assert_allclose(grid[1][:, :2], each[1][:, :2], atol=2e-4)
     beside = np.abs(means[:, 0]) < 1e-3

@@ -50,8 +50,9 @@ def spread_samples(mean: Array, tangent: Array, voxel: float) -> tuple[Array, ND
     """Cover each splat's disc, as wide as its tangents, with samples a voxel apart; return them and their splat."""
     steps = np.clip(np.ceil(2.0 * np.linalg.norm(tangent, axis=1) / voxel), 1, 9).astype(int)
     position, owner = [], []
-    for a, b in np.unique(steps, axis=0):
-        member = np.flatnonzero((steps == (a, b)).all(axis=1))
+    size = 10 * steps[:, 0] + steps[:, 1]
+    for a, b in (divmod(int(key), 10) for key in np.unique(size)):
+        member = np.flatnonzero(size == 10 * a + b)
         u, v = ((np.arange(k) + 0.5) * (2.0 / k) - 1.0 for k in (a, b))
         u, v = (g.ravel() for g in np.meshgrid(u, v, indexing="ij"))
         keep = (u * u + v * v) <= 1.0 if a > 2 and b > 2 else np.ones(len(u), dtype=bool)
@@ -59,6 +60,13 @@ def spread_samples(mean: Array, tangent: Array, voxel: float) -> tuple[Array, ND
         position.append(grid.reshape(-1, 3))
         owner.append(np.repeat(member, int(keep.sum())))
     return np.concatenate(position), np.concatenate(owner)
+
+
+def even_directions(count: int) -> Array:
+    """Return unit vectors (count, 3) spread evenly, on a spiral."""
+    k = np.arange(count) + 0.5
+    polar, azimuth = np.arccos(1.0 - 2.0 * k / count), np.pi * (1.0 + np.sqrt(5.0)) * k
+    return np.stack([np.cos(azimuth) * np.sin(polar), np.sin(azimuth) * np.sin(polar), np.cos(polar)], axis=1)
 
 
 def orient(
@@ -80,14 +88,11 @@ def orient(
         Sign per splat that turns its normal outside, confidence 0..1 per splat, and whether it is seen at all.
     """
     sample, owner = spread_samples(mean, DISC * tangent, pixel)
-    k = np.arange(VIEW_COUNT) + 0.5
-    polar, azimuth = np.arccos(1.0 - 2.0 * k / VIEW_COUNT), np.pi * (1.0 + np.sqrt(5.0)) * k
-    toward = np.stack([np.cos(azimuth) * np.sin(polar), np.sin(azimuth) * np.sin(polar), np.cos(polar)], axis=1)
     vote, most, views = np.zeros(len(mean)), np.zeros(len(mean)), np.zeros(len(mean), dtype=int)
     cell, discs = 1.5 * pixel, np.bincount(owner, minlength=len(mean))
     place = np.ascontiguousarray(((sample - mean.mean(axis=0)) / cell).T, dtype=np.float32)
     half = int(np.sqrt((place**2).sum(axis=0).max())) + 2
-    for direction in toward:
+    for direction in even_directions(VIEW_COUNT):
         helper = np.eye(3)[np.abs(direction).argmin()]
         right = np.cross(direction, helper)
         right /= np.linalg.norm(right)

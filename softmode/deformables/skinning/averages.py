@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from itertools import product
 from typing import Any, Protocol
 
 import numpy as np
@@ -40,7 +42,13 @@ class Functions(Protocol):
         ...
 
 
-def average_basis(functions: Functions, means: ArrayLike, covariances: ArrayLike) -> tuple[Array, Array]:
+def average_basis(
+    functions: Functions,
+    means: ArrayLike,
+    covariances: ArrayLike,
+    *,
+    progress: Callable[[float], None] = lambda share: None,
+) -> tuple[Array, Array]:
     """Return basis values and gradients averaged over each splat, for `SkinSplats`.
 
     A splat is as wide as the deformation varies where a basis is coarse or torn: the gradient at its centre then draws
@@ -57,6 +65,7 @@ def average_basis(functions: Functions, means: ArrayLike, covariances: ArrayLike
         functions: The body.
         means: Rest centres in the body frame [m], shape (N, 3).
         covariances: Rest covariances [m^2], shape (N, 3, 3).
+        progress: Told which share of the splats is done, 0 to 1.
 
     Returns:
         Values, shape (N, n), and gradients [1/m], shape (N, n, 3).
@@ -71,11 +80,13 @@ def average_basis(functions: Functions, means: ArrayLike, covariances: ArrayLike
     grid = _Grid(functions, x, arms, axes, small) if len(x) >= MANY and functions.narrow > 0.0 else None
     sources = [(functions, np.ones(len(x), bool))] if grid is None else [(functions, grid.exact), (grid, ~grid.exact)]
     parts: list[Any] = []  # rows, values, gradients
-    for source, member in sources:
-        for rows in filter(len, _portions(np.flatnonzero(member & small))):
-            parts.append((rows, *source.evaluate(x[rows])))
-        for rows in filter(len, _portions(np.flatnonzero(member & ~small))):
-            parts.append((rows, *_differences(source, x[rows], arms[rows], axes[rows])))
+    done = 0
+    for (source, member), narrow in product(sources, (True, False)):
+        for rows in filter(len, _portions(np.flatnonzero(member & (small == narrow)))):
+            wide = () if narrow else (arms[rows], axes[rows])
+            parts.append((rows, *(_differences(source, x[rows], *wide) if wide else source.evaluate(x[rows]))))
+            done += len(rows)
+            progress(done / len(x))
     back = np.argsort(np.concatenate([rows for rows, _, _ in parts]))
     return np.concatenate([value for _, value, _ in parts])[back], np.concatenate([g for _, _, g in parts])[back]
 
