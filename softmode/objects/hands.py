@@ -62,9 +62,13 @@ def _open_tube(points: Array, normals: Array, near: NDArray[np.intp], end: Array
     turn = np.arctan2(*(across[shell] - middle).T)
     ring = np.histogram(turn, 16, (-np.pi, np.pi))[0]
     across_end = np.count_nonzero((away < 0.5 * radius) & (along > top - 0.6 * length))
-    rest = across[along < top - length]
+    beyond = along < top - length
+    rest = across[beyond]
     if len(rest) < 50:
         return 0.0
+    out = rest - middle
+    sideways = np.abs(normals[beyond] @ frame[:, 1] * out[:, 1] - normals[beyond] @ frame[:, 2] * out[:, 0])
+    turned = float((sideways < 0.35 * np.linalg.norm(out, axis=1)).mean())
     wide: Any = np.ptp(np.quantile(rest, [0.02, 0.98], axis=0), axis=0).max()
     why = {
         "tube": ramp(-float(value[0]), -0.12, -0.05),
@@ -73,6 +77,8 @@ def _open_tube(points: Array, normals: Array, near: NDArray[np.intp], end: Array
         "slim": ramp(radius / size, 0.03, 0.05) * ramp(-radius / size, -0.2, -0.16),
         "long": ramp(length / radius, 1.4, 2.0),
         "beside": ramp(float(wide) / (2.0 * radius), 1.3, 1.8),
+        # The neck of a bottle, whose belly is turned about it.
+        "not turned": ramp(-turned, -0.85, -0.7),
         # What points down may be a leg or a plinth, whose underside was not seen.
         "up": ramp(float(axis[2]), -0.8, -0.65),
     }

@@ -16,12 +16,13 @@ from benchmarks.carriers import MADE, SEEDS, judge
 from softmode.deformables.quadrature.quadrature import quadrature_from_splats
 from softmode.errors import AssetError, ConfigError
 from softmode.objects import ObjectConfig
-from softmode.objects.carriers import DISC, SURE, WIDE, closed, eroded, filled
+from softmode.objects.carriers import DISC, SURE, WIDE, Surface, closed, eroded, filled
+from softmode.objects.hands import HELD, find_arm
 from softmode.objects.parts import choose_part, find_ground
 from softmode.objects.pipeline import standing_quadrature
 from softmode.objects.source import object_source
 from tests.captures import merged, render_shell, sheet, toy
-from tests.carriers import CARRIER, OBJECT, bare, bear, box, carried, render, room, vase
+from tests.carriers import CARRIER, OBJECT, bare, bear, box, carried, lathe, render, room, vase
 from tests.hands import held
 
 FEW = 8_000
@@ -121,6 +122,15 @@ def test_what_a_hand_holds_is_refused() -> None:
     part = tuple(map(int, numbers.split()))
     source = object_source(ObjectConfig(splat=made.splats, part=part))
     assert source.capture["part_splats"] == sum(np.isin(choice.number, part))
+
+
+def test_the_neck_of_a_bottle_is_no_arm() -> None:
+    """It is slim and open at its end, but the belly is turned about it."""
+    outer = [(0.14, 0.0), (0.14, 0.55), (0.07, 0.72), (0.07, 0.97)]
+    inner = [(r - 0.012, max(z, 0.012)) for r, z in reversed(outer)]
+    bottle = [lathe([(0.0, 0.0), *outer, *inner, (0.0, 0.012)])]
+    made = render(bottle, "bottle", np.random.default_rng(1), count=FEW)
+    assert find_arm(Surface.of(made.splats))[0] < HELD
 
 
 def test_bad_captures_are_refused() -> None:
