@@ -209,7 +209,7 @@ def test_frictional_contact(options: SolverReducedOptions) -> None:
 def test_ball_that_rolls() -> None:
     """A ball lands and rolls: its cells' ranges, centres of pressure and neighbourhoods follow the state in every step.
 
-    Held constant they give 1.6 of dL/drho. Within 1e-2 of differences. By ln E the loss nearly cancels, a five hundredth
+    Held constant they give 1.6 of dL/drho. Within 1e-2 of differences. By E the loss nearly cancels, a five hundredth
     of that by nu, and the step is small, since a difference may cross kinks: there within 1e-12, 7 % of it.
     """
     case = Landing(1.0e5, friction=0.8, body=smooth_ball(8, 400))
