@@ -209,20 +209,22 @@ def test_frictional_contact(options: SolverReducedOptions) -> None:
 def test_ball_that_rolls() -> None:
     """A ball lands and rolls: its cells' ranges, centres of pressure and neighbourhoods follow the state in every step.
 
-    Held constant they give -0.26 of dL/dE and 1.6 of dL/drho. Within 1e-2 of differences.
+    Held constant they give 1.6 of dL/drho. Within 1e-2 of differences. By E the loss nearly cancels, a five hundredth
+    of that by nu, and the step is small, since a difference may cross kinks: there within 1e-12, 7 % of it.
     """
     case = Landing(1.0e5, friction=0.8, body=smooth_ball(8, 400))
     gradients = case.gradients()
     steps = {
-        "youngs_modulus": 1e-3,
+        "youngs_modulus": 3e-4,
         "poissons_ratio": 1e-4,
-        "density": 1e-3,
+        "density": 1e-4,
         "scale": 1e-4,
         "friction": 1e-3,
         "qd": 1e-5,
     }
     for name, relative in steps.items():
-        assert case.gradient(gradients, name) == pytest.approx(case.difference(name, relative), rel=1.0e-2), name
+        expected = pytest.approx(case.difference(name, relative), rel=1.0e-2, abs=1.0e-12)
+        assert case.gradient(gradients, name) == expected, name
 
 
 def test_friction_on_a_turntable() -> None:
