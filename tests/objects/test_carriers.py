@@ -129,7 +129,7 @@ def test_the_neck_of_a_bottle_is_no_arm() -> None:
     outer = [(0.14, 0.0), (0.14, 0.55), (0.07, 0.72), (0.07, 0.97)]
     inner = [(r - 0.012, max(z, 0.012)) for r, z in reversed(outer)]
     bottle = [lathe([(0.0, 0.0), *outer, *inner, (0.0, 0.012)])]
-    made = render(bottle, "bottle", np.random.default_rng(1), count=FEW)
+    made = render(bottle, "bottle", np.random.default_rng(1), count=25_000)
     assert find_arm(Surface.of(made.splats))[0] < HELD
 
 
