@@ -1,0 +1,105 @@
+"""How well `softmode fit` finds what objects are made of, on films by code: python -m benchmarks.fit [NAME ...].
+
+The object of the fit is filled anew from 12,000 splats of the true one. Every film has all troubles at once: other
+light, gain, gamma and colours, 2 % noise, a camera 1 cm and 1 degree off, a textured background, a late start.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from softmode.deformables import BuildOptions, Material
+from softmode.errors import SoftmodeError
+from softmode.fitting.film import Clip
+from softmode.fitting.film_fit import fit_film
+from softmode.fitting.holding import Held, held_object
+from softmode.objects import load
+from softmode.splats import write_splats
+from tests.fitting.films import NONE, Trouble, make_film
+
+RATIO, DENSITY = 0.35, 300.0
+CASES = {
+    "banana": ("banana", 0.2, "-x:0.03", 120e3, 4e-3, 1),
+    "banana stiff": ("banana", 0.2, "-x:0.03", 400e3, 4e-3, 2),
+    "bear": ("bear", 0.2, "top:0.05", 40e3, 4e-3, 3),
+    "bear 100": ("bear", 0.2, "top:0.05", 100e3, 3e-3, 4),
+    "sponge": ("sponge", 0.18, "-x:0.03", 60e3, 5e-3, 5),
+    "mug": ("mug", 0.16, "-x:0.03", 80e3, 4e-3, 6),
+    "duck": ("duck", 0.2, "-x:0.04", 50e3, 4e-3, 7),
+    "bunny": ("bunny", 0.2, "top:0.05", 40e3, 6e-3, 8),
+    "star": ("star", 0.2, "-x:0.03", 100e3, 3e-3, 9),
+}
+"""Object, size [m], what is held, E [Pa], viscosity [s], seed."""
+
+
+def run(name: str, *, trouble: Trouble, anew: bool, verbose: bool) -> tuple[float, float, float, float, float]:
+    """Return ln E found over true, its bar, the same of viscosity, and the seconds of the fit."""
+    preset, size, end, youngs_modulus, viscosity, seed = CASES[name]
+    held = Held.parse(end)
+    told = {"size": size, "pose": "captured", "surface_count": 300}
+    first = load(preset, splat_count=12_000 if anew else 2500, build=BuildOptions(function_count=64), **told)
+    truth = held_object(first, held)
+    if anew:
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / f"{preset}.ply"
+            write_splats(file, first.visible_splats.transformed(translation=first.body.offset))
+            thing = held_object(load(file, up="+z", **told), held)
+    else:
+        thing = held_object(load(preset, splat_count=2500, **told), held)
+    made = Material(youngs_modulus=youngs_modulus, viscosity=viscosity, poissons_ratio=RATIO, density=DENSITY)
+    frames, plate, camera = make_film(truth, made, trouble, seed)
+    density = DENSITY * truth.body.volume / thing.body.volume  # the mass is weighed
+    clip = Clip(frames=frames, times=np.arange(len(frames)) / 30.0, name=name)
+    start, wall = time.process_time(), time.perf_counter()
+
+    def tell(stage: str, fraction: float) -> None:
+        if verbose:
+            print(f"   {time.perf_counter() - wall:6.1f} s {stage}", flush=True)
+
+    material = Material(poissons_ratio=RATIO, density=density)
+    found, _, x = fit_film(thing, clip, camera, held, material=material, plate=plate, progress=tell)
+    seconds = time.process_time() - start
+    e, v = found["youngs_modulus"], found["viscosity"]
+    if verbose:
+        print(found.details, np.round(x, 4).tolist())
+    out = (np.log(e.value / youngs_modulus), np.log(e.high / e.value))
+    more = (np.log(v.value / viscosity), np.log(v.high / v.value))
+    print(
+        f"{name:14s} E {youngs_modulus / 1e3:5.0f} kPa: ln error {out[0]:+.3f} +- {out[1]:.3f}"
+        f"{'' if e.observable else ' (not observable)'}; viscosity {1e3 * viscosity:.1f} ms:"
+        f" {more[0]:+.2f} +- {more[1]:.2f}; followed {found.details['followed']:.3f}, {found.details['tracks']} tracks;"
+        f" integrator {found.details['integrator']['viscosity']:.2f} {found.details['integrator']['youngs_modulus']:.3f};"
+        f" volume {thing.body.volume / truth.body.volume:.3f}; {seconds:.0f} s",
+        flush=True,
+    )
+    return (*out, *more, seconds)
+
+
+def main() -> None:
+    """Run cases and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("names", nargs="*")
+    parser.add_argument("--none", action="store_true", help="no trouble")
+    parser.add_argument("--same", action="store_true", help="the object of the fit is built from the same mesh")
+    parser.add_argument("--verbose", action="store_true")
+    options = parser.parse_args()
+    rows = []
+    for name in options.names or CASES:
+        try:
+            trouble = NONE if options.none else Trouble()
+            rows.append(run(name, trouble=trouble, anew=not options.same, verbose=options.verbose))
+        except SoftmodeError as error:
+            print(f"{name:14s} refused: {error}", file=sys.stderr, flush=True)
+    if rows:
+        error = np.abs(np.array(rows))[:, 0]
+        print(f"{len(rows)} films: median {np.median(error):.3f}, largest {error.max():.3f}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,234 @@
+"""`fit_film`: what an object is made of that is held by one end and let go, from a film of one fixed camera."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, replace
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from softmode.deformables.materials.material import Material
+from softmode.errors import FitError
+from softmode.fitting.estimates import Estimate, Fitted, floor_of
+from softmode.fitting.film import Clip, Image, find_mattes, open_cv
+from softmode.fitting.film_residuals import CAMERA, NAMES, FilmResiduals, film_space
+from softmode.fitting.holding import NAME, Held
+from softmode.fitting.least_squares import Solution, Space, cost_of, minimise
+from softmode.fitting.pictures import project
+from softmode.fitting.tracks import follow
+from softmode.fitting.worlds import FitWorlds
+from softmode.objects.soft_object import SoftObject
+from softmode.splats.raster.pinhole import PinholeCamera
+
+Array = NDArray[np.float64]
+Progress = Callable[[str, float], None]
+SPECIFIC = (8.0, 20.0, 50.0, 120.0, 300.0, 750.0, 1900.0, 4700.0, 12000.0, 30000.0)
+"""Young's modulus over density of the starts [m^2/s^2]."""
+APART = 0.3
+"""Least difference of ln E between two starts that are refined."""
+OVERLAP = 0.7
+"""Least overlap of object and matte before anything moves, intersection over union."""
+FOLLOWED = 0.6
+"""Least share of the motion's cost that the twin has to explain."""
+_POSE = NAMES[CAMERA]
+
+
+def fit_film(
+    thing: SoftObject,
+    clip: Clip,
+    camera: PinholeCamera,
+    held: Held,
+    *,
+    material: Material,
+    plate: Image | None = None,
+    mass_known: bool = True,
+    device: wp.DeviceLike = None,
+    progress: Progress | None = None,
+) -> tuple[Fitted, FilmResiduals, Array]:
+    """Fit Young's modulus and viscosity, with gravity, start, camera, matte and holder free about what is told.
+
+    Args:
+        thing: The object with its end held, see `held_object`.
+        clip: The film.
+        camera: About where the camera is, in the axes of the object's file, for frames of the film's size.
+        held: What is held.
+        material: Density and Poisson's ratio; the rest is where the fit begins.
+        plate: The picture without the object, of the film's size.
+        mass_known: Whether the density is measured; else only E over density is told.
+        device: Warp device.
+        progress: Told each stage and how far it is, 0..1.
+
+    Returns:
+        What was found; what it was fitted with; and all parameters, as `film_residuals.NAMES` has them.
+
+    Raises:
+        FitError: If the film does not show it: nothing moves, the object is another one, the motion is not followed.
+    """
+    tell = progress or (lambda stage, fraction: None)
+    tell("looking at the film", 0.0)
+    mattes = find_mattes(clip, plate)
+    tracks = follow(clip, mattes.cover)
+    placed = replace(camera, position=tuple(np.subtract(camera.position, thing.body.offset).tolist()))
+    residuals = FilmResiduals(thing, material, clip, mattes, placed, device=device)
+    every, release = residuals.frames, float(clip.times[mattes.release])
+    space = film_space(release - 0.25 * clip.interval, clip.interval, material.density)
+
+    tell("finding the camera", 0.05)
+    still = np.unique(np.linspace(0, mattes.release, 3).astype(int))
+    residuals.frames = still
+    posed = replace(space, mean=np.where(np.arange(15) == 4, clip.times[-1], space.mean), high=np.full(15, np.inf))
+    pose = minimise(residuals, posed, posed.mean, (*_POSE, "edge"), rounds=6).x
+    mask, overlap = _compared(residuals, pose, mattes.cover[0], held)
+    if overlap < OVERLAP:
+        what = f"film {clip.name}: only {overlap:.0%} of object and picture overlap before it is let go"
+        raise FitError(what, hint="check --size, --up, the object and the camera of the scene, or give --plate")
+    residuals.mask(mask)
+    residuals.frames, residuals.moving = every, True
+
+    tell("trying stiffnesses", 0.15)
+    sets = np.repeat(np.where(np.arange(15) == 4, space.mean, pose)[None], len(SPECIFIC), axis=0)
+    sets[:, 0] = np.log(np.array(SPECIFIC) * material.density)
+    costs = cost_of(residuals(sets))
+    none = sets[:1].copy()
+    none[0, 4] = clip.times[-1]
+    unmoved = float(cost_of(residuals(none))[0])
+    starts: list[int] = []
+    for k in np.argsort(costs):
+        if all(abs(sets[k, 0] - sets[j, 0]) > APART for j in starts) and len(starts) < 2:
+            starts.append(int(k))
+    found: list[Solution] = []
+    motion = ("youngs_modulus", "viscosity", "start", *_POSE, "edge")
+    for n, k in enumerate(starts):
+        tell("fitting", 0.3 + 0.15 * n)
+        tight = replace(space, prior=np.where(np.arange(15) == 1, 0.5, space.prior))
+        found.append(minimise(residuals, tight, sets[k], motion, rounds=4))
+    best = min(found, key=lambda one: one.cost)
+    tell("fitting", 0.6)
+    best = minimise(residuals, space, best.x, NAMES, rounds=4)
+    tell("fitting with tracks", 0.8)
+    residuals.anchor(tracks, best.x)
+    best = minimise(residuals, space, best.x, NAMES, rounds=6)
+    followed = 1.0 - float(cost_of(best.residuals[None, : residuals.sizes[0]])[0]) / unmoved
+    if followed < FOLLOWED:
+        what = f"film {clip.name}: not observable, because the twin follows {followed:.0%} of what moves"
+        raise FitError(what, hint="film one object that is held by one end and let go, before a background at rest")
+    tell("the integrator's share", 0.95)
+    shift = integrator_shift(thing, material, best.x, float(clip.times[-1] - best.x[4]), residuals.worlds.dt, device)
+    x = best.x.copy()
+    x[:2] -= shift
+    told = _told(thing, clip, space, best, x, residuals, mass_known, material)
+    details = {
+        "camera": dict(zip(_POSE, best.x[CAMERA].tolist(), strict=True)) | {"nominal": asdict(camera)},
+        "start": float(best.x[4]),
+        "followed": followed,
+        "tracks": len(residuals.tracks),
+        "starts": [{"youngs_modulus": float(np.exp(one.x[0])), "cost": one.cost} for one in found],
+        "residual_of_frames": _by_frames(residuals, best),
+        "integrator": {"youngs_modulus": float(np.exp(shift[0])), "viscosity": float(np.exp(shift[1]))},
+        "world_steps": residuals.worlds.steps,
+        "pictures": residuals.pictures.drawn,
+    }
+    tell("done", 1.0)
+    return replace(told, details=details), residuals, best.x
+
+
+def _told(
+    thing: SoftObject,
+    clip: Clip,
+    space: Space,
+    best: Solution,
+    x: Array,
+    residuals: FilmResiduals,
+    mass_known: bool,
+    material: Material,
+) -> Fitted:
+    """Return what is told of a solution, with bars."""
+    deviation = dict(zip(best.free.tolist(), best.deviations(residuals.blocks()), strict=True))
+    bar = float(np.hypot(deviation[0], floor_of(thing)))
+    at_end = min(x[0] - space.low[0], space.high[0] - x[0]) < 0.2
+    why = "the film looks the same at every stiffness beyond it" if at_end else ""
+    modulus = Estimate.of_logarithm(x[0], bar, unit="Pa", reason=why)
+    swings = "its motion dies, or is too small, before a second swing is seen" if deviation[1] > 0.5 else ""
+    viscosity = Estimate.of_logarithm(x[1], float(np.hypot(deviation[1], 0.1)), unit="s", reason=swings)
+    notes = [f"from {len(clip.times)} frames and {len(residuals.tracks)} tracks"]
+    frequency = first_frequency(thing, float(np.exp(x[0])), material)
+    if frequency > 0.5 / clip.interval:
+        notes.append(
+            f"the object swings at {frequency:.3g} Hz, beyond half of the film's {1.0 / clip.interval:.3g} frames per"
+            " second: film faster, or give --fps-true if it was"
+        )
+    changes = {"youngs_modulus": modulus.value} if modulus.observable else {}
+    if viscosity.observable:
+        changes["viscosity"] = viscosity.value
+    estimates = {"youngs_modulus": modulus, "viscosity": viscosity}
+    if not mass_known:
+        over = {name: getattr(modulus, name) / material.density for name in ("value", "low", "high")}
+        ratio = replace(modulus, unit="m^2/s^2", **over)
+        estimates = {"youngs_modulus_over_density": ratio, **estimates}
+        notes.append(f"E is for {material.density:g} kg/m^3, which was not measured: give --mass for E")
+    return Fitted(
+        source=clip.name,
+        fingerprint=clip.fingerprint,
+        estimates=estimates,
+        material=replace(material, **changes),
+        notes=tuple(notes),
+    )
+
+
+def _compared(residuals: FilmResiduals, x: Array, cover: Array, held: Held) -> tuple[Array, float]:
+    """Return where the film is compared (H, W): not on the holder; and how far object and matte overlap."""
+    cv2 = open_cv()
+    q, poses = residuals.states(x[None])[0, :1], residuals.poses(x[None])[0, :1]
+    alpha = residuals.pictures.draw(q, poses)[0]
+    near = cv2.dilate((alpha > 0.1).astype(np.uint8), np.ones((9, 9)))
+    hand = cv2.dilate(((cover > 0.5) & (near == 0)).astype(np.uint8), np.ones((7, 7))) > 0
+    means = residuals.thing.visible_splats.means
+    inside = residuals.thing.body.regions.envelope(1.0)
+    grip = inside.holds(means) if inside is not None else np.zeros(len(means), bool)
+    pixels = np.round(project(residuals.camera, poses[0], means[grip])[0] - 0.5).astype(int)
+    spots = np.zeros(cover.shape, np.uint8)
+    shown = ((pixels >= 0) & (pixels < np.array(cover.shape[::-1]))).all(axis=1)
+    spots[pixels[shown, 1], pixels[shown, 0]] = 1
+    away = hand | (cv2.dilate(spots, np.ones((5, 5))) > 0)
+    both, one = (alpha > 0.5) & (cover > 0.5) & ~away, ((alpha > 0.5) | (cover > 0.5)) & ~away
+    return (~away).astype(np.float64), float(both.sum() / max(one.sum(), 1))
+
+
+def _by_frames(residuals: FilmResiduals, best: Solution) -> list[float]:
+    """Return the root mean square of the coverage's residual in each frame."""
+    cover = best.residuals[: residuals.sizes[0]].reshape(len(residuals.frames), -1)
+    return np.round(np.sqrt((cover**2).mean(axis=1)), 4).tolist()
+
+
+def first_frequency(thing: SoftObject, youngs_modulus: float, material: Material) -> float:
+    """Return about the lowest frequency of an object that one end holds [Hz]: that of a cantilever of its size."""
+    low, high = thing.body.bounds
+    span = np.sort(high - low)
+    return 0.1615 * float(span[0]) / float(span[2]) ** 2 * float(np.sqrt(youngs_modulus / material.density))
+
+
+def integrator_shift(
+    thing: SoftObject, material: Material, x: Array, seconds: float, dt: float, device: wp.DeviceLike
+) -> Array:
+    """Return by how much ln E and ln viscosity come out too large because of the steps, (2,).
+
+    With steps of a quarter the body moves as it does with these steps and a little more of both; by how much is found
+    from their derivatives, along the motion of the surface.
+    """
+    rows = thing.body.surface.basis[:: max(1, thing.body.surface_count // 60)]
+
+    def motion(sets: Array, step: float) -> Array:
+        worlds = FitWorlds(thing.body, material, len(sets), dt=step, device=device)
+        given = {"youngs_modulus": np.exp(sets[:, 0]), "viscosity": np.exp(sets[:, 1])}
+        q = worlds.run(given, seconds, tilt=sets[:, 2:4], every=2 * round(dt / step))[1]
+        return np.einsum("sk,twkc->wtsc", rows, q).reshape(len(sets), -1)
+
+    sets = np.repeat(x[None, :4], 3, axis=0)
+    steps = np.array([0.02, 0.1])
+    sets[1, 0] += steps[0]
+    sets[2, 1] += steps[1]
+    coarse, fine = motion(sets, dt), motion(sets[:1], dt / 4.0)
+    slopes = (coarse[1:] - coarse[0]) / steps[:, None]
+    return np.linalg.lstsq(slopes.T, fine[0] - coarse[0], rcond=None)[0]
