@@ -31,9 +31,12 @@ CASES = {
     "bear 100": ("bear", 0.2, "top:0.05", 100e3, 3e-3, 4),
     "sponge": ("sponge", 0.18, "-x:0.03", 60e3, 5e-3, 5),
     "mug": ("mug", 0.16, "-x:0.03", 80e3, 4e-3, 6),
-    "duck": ("duck", 0.2, "-x:0.04", 50e3, 4e-3, 7),
-    "bunny": ("bunny", 0.2, "top:0.05", 40e3, 6e-3, 8),
-    "star": ("star", 0.2, "-x:0.03", 100e3, 3e-3, 9),
+    "fish": ("fish", 0.2, "-x:0.04", 60e3, 4e-3, 7),
+    "glove": ("glove", 0.2, "bottom:0.04", 40e3, 6e-3, 8),
+    "doughnut": ("doughnut", 0.2, "-x:0.03", 100e3, 3e-3, 9),
+    "bread": ("bread", 0.22, "-x:0.03", 60e3, 5e-3, 10),
+    "cushion": ("cushion", 0.22, "-x:0.03", 50e3, 4e-3, 11),
+    "banana slow": ("banana", 0.25, "-x:0.03", 70e3, 8e-3, 12),
 }
 """Object, size [m], what is held, E [Pa], viscosity [s], seed."""
 

@@ -61,6 +61,19 @@ class Clip:
         """Usual time between two frames [s]."""
         return float(np.median(np.diff(self.times)))
 
+    def like(self, path: Path) -> Image:
+        """Return a picture of the same camera, of the film's size.
+
+        Raises:
+            AssetError: If it cannot be read.
+        """
+        cv2 = open_cv()
+        found = cv2.imread(str(path), cv2.IMREAD_COLOR)
+        if found is None:
+            raise AssetError(f"plate {path}: cannot be read", hint="give a .png or .jpg of the background")
+        size = self.frames.shape[2], self.frames.shape[1]
+        return cv2.resize(found[..., ::-1], size, interpolation=cv2.INTER_AREA)
+
     @classmethod
     def read(cls, path: Path, *, fps_true: float | None = None) -> Clip:
         """Read a film: times and rotation as the file has them, frames at most `EDGE` wide and high.

@@ -80,13 +80,13 @@ class FilmResiduals:
         """Frames that are compared."""
         self.moving = False
         """Whether most of the mean over time is taken off."""
-        self._cover = mattes.cover
+        self.cover = mattes.cover
         self.mask(mattes.mask)
 
     def mask(self, mask: Array) -> None:
         """Compare pixels where a mask (H, W) is 1, and near the object."""
         cv2 = open_cv()
-        self._mask, self._target = mask, self._small(self._cover * mask)
+        self._mask, self._target = mask, self._small(self.cover * mask)
         near = cv2.dilate((self._target.max(axis=0) > 0.02).astype(np.uint8), np.ones((9, 9))) > 0
         self._pixels = near & (self._small(mask[None])[0] > 0.99)
 

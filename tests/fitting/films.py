@@ -62,11 +62,11 @@ def motion(thing: SoftObject, material: Material, seconds: float, dt: float) -> 
     model = builder.finalize(device="cpu")
     solver = SolverReduced(model, [thing.body], options=SolverReducedOptions(integrator="bdf2", tolerance=1e-6))
     states = [model.state(), model.state()]
-    found = [soft(states[0]).q.numpy()]
+    found = [soft(states[0]).q.numpy().copy()]  # on CPU it is a view
     for _ in range(round(seconds / dt / 2)):
         solver.step(states[0], states[1], None, None, dt)
         solver.step(states[1], states[0], None, None, dt)
-        found.append(soft(states[0]).q.numpy())
+        found.append(soft(states[0]).q.numpy().copy())
     return np.array(found, np.float64), model
 
 
