@@ -25,8 +25,8 @@ from tests.fitting.films import NONE, Trouble, make_film
 
 RATIO, DENSITY = 0.35, 300.0
 CASES = {
-    "banana": ("banana", 0.2, "-x:0.03", 120e3, 4e-3, 1),
-    "banana stiff": ("banana", 0.2, "-x:0.03", 400e3, 4e-3, 2),
+    "banana": ("banana", 0.2, "+x:0.04", 120e3, 4e-3, 1),
+    "banana stiff": ("banana", 0.2, "+x:0.04", 400e3, 4e-3, 2),
     "bear": ("bear", 0.2, "top:0.05", 40e3, 4e-3, 3),
     "bear 100": ("bear", 0.2, "top:0.05", 100e3, 3e-3, 4),
     "sponge": ("sponge", 0.18, "-x:0.03", 60e3, 5e-3, 5),
@@ -36,7 +36,7 @@ CASES = {
     "doughnut": ("doughnut", 0.2, "-x:0.03", 100e3, 3e-3, 9),
     "bread": ("bread", 0.22, "-x:0.03", 60e3, 5e-3, 10),
     "cushion": ("cushion", 0.22, "-x:0.03", 50e3, 4e-3, 11),
-    "banana slow": ("banana", 0.25, "-x:0.03", 70e3, 8e-3, 12),
+    "banana slow": ("banana", 0.25, "+x:0.04", 70e3, 8e-3, 12),
 }
 """Object, size [m], what is held, E [Pa], viscosity [s], seed."""
 

@@ -166,7 +166,9 @@ def find_mattes(clip: Clip, plate: Image | None) -> Mattes:
     noise = max(float(1.4826 / np.sqrt(2.0) * np.median(np.abs(steps[steps != 0.0]))) if steps.any() else 0.0, 1.0)
     back = np.median(smooth, axis=0) if plate is None else plate.astype(np.float32)
     if back.shape != smooth.shape[1:]:
-        raise FitError(f"plate has shape {back.shape}, the film {smooth.shape[1:]}", hint="take it with the same camera")
+        raise FitError(
+            f"plate has shape {back.shape}, the film {smooth.shape[1:]}", hint="take it with the same camera"
+        )
     level = np.clip((smooth * back).sum(axis=3) / ((back * back).sum(axis=2) + 1e-6), 0.98, 1.02)
     away = np.sqrt(((smooth - level[..., None] * back) ** 2).mean(axis=3))
     cover = np.array([_solid(np.clip((a - 3.0 * noise) / (7.0 * noise), 0.0, 1.0)) for a in away])
@@ -217,7 +219,9 @@ def _release(clip: Clip, cover: Array) -> int:
     change = np.abs(soft - soft[0]).reshape(len(soft), -1).sum(axis=1)
     rim = np.sqrt(max(float((cover[0] > 0.5).sum()), 1.0))
     if change.max() < 1.3 * flicker + 0.1 * rim:
-        hint = "let go of one end, hold it so that it sags, or film a softer object; a stiff one needs --press and a scale"
+        hint = (
+            "let go of one end, hold it so that it sags, or film a softer object; a stiff one needs --press and a scale"
+        )
         raise FitError(f"film {clip.name}: not observable, because nothing moves by more than a pixel", hint=hint)
     moved = np.flatnonzero(change > 1.3 * flicker + 0.08 * (change.max() - 1.3 * flicker))
     return max(int(moved[0]) - 1, 0)

@@ -13,7 +13,7 @@ from softmode.deformables.materials.material import Material
 from softmode.errors import FitError
 from softmode.fitting.estimates import Estimate, Fitted, floor_of
 from softmode.fitting.film import Clip, Image, find_mattes, open_cv
-from softmode.fitting.film_residuals import CAMERA, NAMES, FilmResiduals, film_space
+from softmode.fitting.film_residuals import CAMERA, HOLDER, NAMES, FilmResiduals, film_space
 from softmode.fitting.holding import NAME, Held
 from softmode.fitting.least_squares import Solution, Space, cost_of, minimise
 from softmode.fitting.pictures import project
@@ -33,6 +33,7 @@ OVERLAP = 0.7
 FOLLOWED = 0.6
 """Least share of the motion's cost that the twin has to explain."""
 _POSE = NAMES[CAMERA]
+_LASTING = (*_POSE, *NAMES[HOLDER], "edge")
 
 
 def fit_film(
@@ -93,7 +94,7 @@ def fit_film(
     costs = cost_of(residuals(sets))
     none = sets[:1].copy()
     none[0, 4] = clip.times[-1]
-    unmoved = float(cost_of(residuals(none))[0])
+    unmoved = residuals(none)[0]
     starts: list[int] = []
     for k in np.argsort(costs):
         if all(abs(sets[k, 0] - sets[j, 0]) > APART for j in starts) and len(starts) < 2:
@@ -103,14 +104,18 @@ def fit_film(
     for n, k in enumerate(starts):
         tell("fitting", 0.3 + 0.15 * n)
         tight = replace(space, prior=np.where(np.arange(15) == 1, 0.5, space.prior))
-        found.append(minimise(residuals, tight, sets[k], motion, rounds=4))
+        found.append(minimise(residuals, tight, sets[k], motion, rounds=4, lasting=_LASTING))
     best = min(found, key=lambda one: one.cost)
     tell("fitting", 0.6)
-    best = minimise(residuals, space, best.x, NAMES, rounds=4)
+    best = minimise(residuals, space, best.x, NAMES, rounds=4, lasting=_LASTING)
     tell("fitting with tracks", 0.8)
     residuals.anchor(tracks, best.x)
-    best = minimise(residuals, space, best.x, NAMES, rounds=6)
-    followed = 1.0 - float(cost_of(best.residuals[None, : residuals.sizes[0]])[0]) / unmoved
+    best = minimise(residuals, space, best.x, NAMES, rounds=6, lasting=_LASTING)
+    followed = _followed(residuals, best.residuals[: residuals.sizes[0]], unmoved)
+    tell(
+        f"DEBUG grid {np.round(costs, 1)} unmoved {cost_of(unmoved[None])[0]:.1f} best {best.cost:.1f} followed {followed:.3f} pose {np.round(pose, 4).tolist()} x {np.round(best.x, 4).tolist()} overlap {overlap:.3f} release {mattes.release} pixels {residuals._pixels.sum()} noise {mattes.noise:.2f} starts {[(round(float(np.exp(o.x[0]))), round(o.cost, 1)) for o in found]} dev {best.deviations(residuals.blocks())[:2]}",
+        0.9,
+    )
     if followed < FOLLOWED:
         what = f"film {clip.name}: not observable, because the twin follows {followed:.0%} of what moves"
         raise FitError(what, hint="film one object that is held by one end and let go, before a background at rest")
@@ -194,6 +199,25 @@ def _compared(residuals: FilmResiduals, x: Array, cover: Array, held: Held) -> t
     away = hand | (cv2.dilate(spots, np.ones((5, 5))) > 0)
     both, one = (alpha > 0.5) & (cover > 0.5) & ~away, ((alpha > 0.5) | (cover > 0.5)) & ~away
     return (~away).astype(np.float64), float(both.sum() / max(one.sum(), 1))
+
+
+def _followed(residuals: FilmResiduals, left: Array, unmoved: Array) -> float:
+    """Return how much of what moves the twin follows, 0..1.
+
+    What is left holds noise, which is new in each frame, and what is not followed, which is not: the correlation
+    between frames tells them apart.
+
+    Args:
+        residuals: What the film was fitted with.
+        left: Residuals of the coverage that are left (M,).
+        unmoved: Those of a twin that stays at rest (M,).
+    """
+    r = left.reshape(len(residuals.frames), -1)
+    r = r - r.mean(axis=0)
+    alike = max(abs(float((r[k:] * r[:-k]).sum())) for k in (1, 2)) / max(float((r * r).sum()), 1e-12)
+    before, after = cost_of(unmoved[None])[0], cost_of(left[None])[0]
+    signal = max(float(before - after), 0.0)
+    return signal / max(signal + alike * float(after), 1e-12)
 
 
 def _by_frames(residuals: FilmResiduals, best: Solution) -> list[float]:

@@ -12,6 +12,8 @@ from scipy.optimize import least_squares
 Array = NDArray[np.float64]
 Residuals = Callable[[Array], Array]
 """From parameters (W, p) to residuals in units of their noise (W, M)."""
+KEPT = 3
+"""Jacobians for which lasting derivatives are kept."""
 HUBER = 2.5
 """Residuals beyond this count by their size and not by its square."""
 
@@ -78,7 +80,14 @@ class Solution:
 
 
 def minimise(
-    residuals: Residuals, space: Space, start: Array, free: Sequence[str], *, rounds: int, tolerance: float = 1.0e-3
+    residuals: Residuals,
+    space: Space,
+    start: Array,
+    free: Sequence[str],
+    *,
+    rounds: int,
+    lasting: Sequence[str] = (),
+    tolerance: float = 1.0e-3,
 ) -> Solution:
     """Find the parameters of least residuals near a start.
 
@@ -88,6 +97,7 @@ def minimise(
         start: Where to begin (p,).
         free: Which of them may change.
         rounds: Jacobians at most.
+        lasting: Those whose derivatives hardly change: they are kept for `KEPT` Jacobians.
         tolerance: Relative change of the cost, and of the parameters in their priors, at which it ends.
     """
     which = space.index(*free)
@@ -98,13 +108,19 @@ def minimise(
         """Return residuals and Jacobian, priors included."""
         key = y.tobytes()
         if key not in known:
-            known.clear()
-            sets = np.repeat(start[None], len(which) + 1, axis=0)
+            renewed = np.ones(len(which), bool) if len(counted) % KEPT == 0 else ~lasts
+            rows = np.flatnonzero(renewed)
+            sets = np.repeat(start[None], len(rows) + 1, axis=0)
             sets[:, which] = y
             steps = np.where(y + space.step[which] > space.high[which], -1.0, 1.0) * space.step[which]
-            sets[np.arange(len(which)) + 1, which] += steps
+            sets[np.arange(len(rows)) + 1, which[rows]] += steps[rows]
             found = residuals(sets)
-            slopes = ((found[1:] - found[0]) / steps[:, None]).T
+            slopes = ((found[1:] - found[0]) / steps[rows, None]).T
+            if not renewed.all():
+                fresh, slopes = slopes, latest[0].copy()
+                slopes[:, rows] = fresh
+            latest[:] = [slopes]
+            known.clear()
             known[key] = (
                 np.append(found[0], (y - mean) / prior),
                 np.vstack([slopes, np.diag(1.0 / prior)]),
@@ -113,6 +129,8 @@ def minimise(
         return known[key]
 
     counted: list[int] = []
+    latest: list[Array] = []
+    lasts = np.isin(np.array(free), lasting)
     found = least_squares(
         lambda y: batch(y)[0],
         np.clip(start[which], space.low[which] + 1e-9, space.high[which] - 1e-9),

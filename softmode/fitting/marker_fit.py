@@ -119,12 +119,9 @@ class MarkerFit:
         Raises:
             FitError: If the file lacks a marker.
         """
-        gone = [name for name in self.places.points if name not in markers.names]
-        if gone:
-            hint = f"the file has {', '.join(markers.names)}"
-            raise FitError(f"{markers.source}: has no marker {', '.join(gone)}", hint=hint)
-        some = markers.places[:, [markers.names.index(name) for name in self.places.points]]
-        return (some - some[: max(markers.release - 4, 5)].mean(axis=0)) @ self.places.rotation.T
+        some = markers.of(list(self.places.points))
+        still = some.places[max(some.release - 30, 0) : max(some.release - 2, 3)].mean(axis=0)
+        return (some.places - still) @ self.places.rotation.T
 
     def sag(self, moduli: ArrayLike) -> Array:
         """Return where the markers rest under gravity and the load, for each Young's modulus [m], (W, M, 3)."""
@@ -145,7 +142,8 @@ class MarkerFit:
         Returns:
             Parameters as `NAMES` has them, their standard deviations, and the rms of what is left [m].
         """
-        moved, release = self.moved(markers), markers.times[markers.release]
+        moved, markers = self.moved(markers), markers.of(list(self.places.points))
+        release = markers.times[markers.release]
         last = min(len(moved) - 1, int(np.searchsorted(markers.times, release + 1.5)))
         frames = np.arange(markers.release, last + 1)
         times, noise = markers.times[frames], max(markers.noise, 2.0e-4)

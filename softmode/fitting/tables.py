@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -40,15 +40,33 @@ class Markers:
         quiet = np.sort(np.abs(steps).mean(axis=(1, 2)))[: max(len(steps) // 4, 4)]
         return max(float(quiet.mean()) / np.sqrt(6.0) * 1.25, 2.0e-5)
 
+    def of(self, names: Sequence[str]) -> Markers:
+        """Return some of the markers.
+
+        Raises:
+            FitError: If there is none of a name.
+        """
+        gone = [name for name in names if name not in self.names]
+        if gone:
+            hint = f"the file has {', '.join(self.names)}"
+            raise FitError(f"{self.source}: has no marker {', '.join(gone)}", hint=hint)
+        places = self.places[:, [self.names.index(name) for name in names]]
+        return Markers(times=self.times, names=tuple(names), places=places, source=self.source)
+
     @property
     def release(self) -> int:
-        """The last frame before one of them moves by ten times the noise."""
+        """The last frame before one of them has moved by ten times the noise and 2 % of its way.
+
+        Raises:
+            FitError: If none moves.
+        """
         away = np.linalg.norm(self.places - self.places[:5].mean(axis=0), axis=2).max(axis=1)
-        moved = np.flatnonzero(away > max(10.0 * self.noise, 3.0e-4))
-        if not len(moved):
+        if away.max() < 20.0 * self.noise:
             hint = "let the object go, or hang a weight on it"
             raise FitError(f"{self.source}: not observable, because no marker moves", hint=hint)
-        return max(int(moved[0]) - 1, 0)
+        moved = away > max(10.0 * self.noise, 0.02 * away.max())
+        still = np.flatnonzero(~moved[: int(away.argmax()) + 1])  # a hand may shake it a little before
+        return int(still[-1]) if len(still) else 0
 
 
 def _rows(path: Path, what: str) -> tuple[list[str], Array]:
@@ -143,9 +161,7 @@ def read_forces(path: Path) -> ForceLog:
         hint = "give columns like depth [mm],force [N], or opening [mm],force [N]"
         raise FitError(f"force log {path}: has columns {', '.join(titles)}", hint=hint)
     good = np.isfinite(columns[way]) & np.isfinite(columns["force"])
-    log = ForceLog(
-        way=columns[way][good], force=columns["force"][good], opening=way == "opening", source=str(path)
-    )
+    log = ForceLog(way=columns[way][good], force=columns["force"][good], opening=way == "opening", source=str(path))
     if len(log.way) < 4 or not log.force.max() > 0.0 or np.ptp(log.way) == 0.0:
         raise FitError(f"force log {path}: nothing presses", hint="give forces > 0 at four depths or more")
     return log

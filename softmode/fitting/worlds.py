@@ -135,5 +135,6 @@ def at_times(times: Array, values: Array, wanted: Array) -> Array:
     low, high = values[k], values[k + 1]
     # Catmull-Rom; at rest before the start
     return low + 0.5 * a * (
-        (high - before) + a * (2.0 * before - 5.0 * low + 4.0 * high - after + a * (3.0 * (low - high) + after - before))
+        (high - before)
+        + a * (2.0 * before - 5.0 * low + 4.0 * high - after + a * (3.0 * (low - high) + after - before))
     )

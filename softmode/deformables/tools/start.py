@@ -52,6 +52,8 @@ def _rows(name: str, given: ArrayLike, count: int, worlds: int) -> NDArray[np.fl
     if found.shape == (count // worlds, 3):
         found = np.broadcast_to(found, (worlds, count // worlds, 3))
     if found.shape not in ((count, 3), (worlds, count // worlds, 3)) or not np.isfinite(found).all():
-        hint = f"give finite vectors of shape ({worlds}, {count // worlds}, 3), or ({count // worlds}, 3) for all worlds"
+        hint = (
+            f"give finite vectors of shape ({worlds}, {count // worlds}, 3), or ({count // worlds}, 3) for all worlds"
+        )
         raise ConfigError(f"{name}: {worlds} worlds have {count} rows, got shape {found.shape}", hint=hint)
     return found.reshape(count, 3)
