@@ -11,6 +11,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +22,10 @@ from softmode.fitting.film_fit import fit_film
 from softmode.fitting.holding import Held, held_object
 from softmode.objects import load
 from softmode.splats import write_splats
-from tests.fitting.films import NONE, Trouble, make_film
+from softmode.splats.colored_mesh import ColoredMesh
+from tests.fitting.films import NONE, Trouble, make_film, motion
+from tests.oracle import fem
+from tests.oracle.scenes import INFINITE, Box, Clamp, Scene, Shape
 
 RATIO, DENSITY = 0.35, 300.0
 CASES = {
@@ -39,24 +43,71 @@ CASES = {
     "banana slow": ("banana", 0.25, "+x:0.04", 70e3, 8e-3, 12),
 }
 """Object, size [m], what is held, E [Pa], viscosity [s], seed."""
+FEM = {
+    "fem bar": (((0.0, 0.0, 0.0, 0.2, 0.05, 0.04),), 60e3, 21),
+    "fem T": (((0.0, 0.0, 0.0, 0.16, 0.04, 0.04), (0.12, -0.04, 0.0, 0.16, 0.08, 0.04)), 50e3, 22),
+    "fem step": (((0.0, 0.0, 0.0, 0.1, 0.06, 0.05), (0.1, 0.0, 0.0, 0.2, 0.06, 0.03)), 60e3, 23),
+}
+"""Boxes [m], E [Pa], seed: moved by quadratic finite elements of tests/oracle, the first 3 cm along x held."""
 
 
-def run(name: str, *, trouble: Trouble, anew: bool, verbose: bool) -> tuple[float, float, float, float, float]:
+def fem_truth(name: str) -> tuple[Any, Any, Material, int]:
+    """Return an object held at its lower x, its motion by finite elements in its functions, its material, the seed."""
+    boxes, youngs_modulus, seed = FEM[name]
+    shape = Shape(boxes=tuple(Box(lower=b[:3], upper=b[3:]) for b in boxes))
+    made = Material(youngs_modulus=youngs_modulus, poissons_ratio=RATIO, density=DENSITY)
+    end = Box(lower=(-INFINITE,) * 3, upper=(0.03, INFINITE, INFINITE))
+    scene = Scene(
+        name=name, shape=shape, energy="stable_neo_hookean_log", youngs_modulus=youngs_modulus, poissons_ratio=RATIO,
+        density=DENSITY, clamps=(Clamp(region=end),), gravity=(0.0, 0.0, -9.81), dt=1.0 / 480.0, steps=480,
+        cell=0.03, grading=0.5,
+    )  # fmt: skip
+    solid, moved = fem.simulate(scene)
+    import trimesh
+
+    mesh = trimesh.Trimesh(*shape.surface()).subdivide_to_size(0.012)
+    stripes = (40 + 180 * (np.sin(90 * mesh.vertices[:, :1] + 60 * mesh.vertices[:, 1:2] + [0, 2, 4]) > 0)).astype("u1")
+    mesh.visual.vertex_colors = np.hstack([stripes, np.full((len(stripes), 1), 255, np.uint8)])
+    size = float(np.ptp(mesh.vertices, axis=0).max())
+    first = load(
+        ColoredMesh.from_trimesh(mesh), size=size, pose="captured", surface_count=300, splat_count=12_000,
+        build=BuildOptions(function_count=96), material=made,
+    )  # fmt: skip
+    truth = held_object(first, Held.parse("-x:0.03"))
+    body = truth.body
+    points, weights = body.cubature.points, body.cubature.weights
+    shift = shape.bounds[0] - (body.bounds + body.offset)[0]  # the object stands on z = 0 around the origin
+    matrix = solid.mesh.interpolation(np.clip(points + body.offset + shift, *(shape.bounds + [[1e-9], [-1e-9]])))
+    q = np.array([body.fit(matrix @ u, points, weights) for u in moved[::2]])
+    _, model = motion(truth, made, 0.01, 1.0 / 480.0)
+    return first, (truth, (q, model)), made, seed
+
+
+def run(
+    name: str, *, trouble: Trouble, anew: bool, verbose: bool, device: str | None = None
+) -> tuple[float, float, float, float, float]:
     """Return ln E found over true, its bar, the same of viscosity, and the seconds of the fit."""
-    preset, size, end, youngs_modulus, viscosity, seed = CASES[name]
-    held = Held.parse(end)
-    told = {"size": size, "pose": "captured", "surface_count": 300}
-    first = load(preset, splat_count=12_000 if anew else 2500, build=BuildOptions(function_count=64), **told)
-    truth = held_object(first, held)
+    held, moved, dt = Held.parse("-x:0.03"), None, 1.0 / 960.0
+    if name in FEM:
+        first, (truth, moved), made, seed = fem_truth(name)
+        size, preset, dt = float(np.ptp(first.body.bounds, axis=0).max()), name, 1.0 / 480.0
+    else:
+        preset, size, end, youngs_modulus, viscosity, seed = CASES[name]
+        held = Held.parse(end)
+        made = Material(youngs_modulus=youngs_modulus, viscosity=viscosity, poissons_ratio=RATIO, density=DENSITY)
+        told = {"size": size, "pose": "captured", "surface_count": 300, "material": made}
+        first = load(preset, splat_count=12_000 if anew else 2500, build=BuildOptions(function_count=64), **told)
+        truth = held_object(first, held)
     if anew:
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / f"{preset}.ply"
             write_splats(file, first.visible_splats.transformed(translation=first.body.offset))
-            thing = held_object(load(file, up="+z", **told), held)
+            told = {"size": size, "pose": "captured", "surface_count": 300}
+            thing = held_object(load(file, up="+z", material=made, **told), held)
     else:
-        thing = held_object(load(preset, splat_count=2500, **told), held)
-    made = Material(youngs_modulus=youngs_modulus, viscosity=viscosity, poissons_ratio=RATIO, density=DENSITY)
-    frames, plate, camera = make_film(truth, made, trouble, seed)
+        thing = held_object(load(preset, splat_count=2500, size=size, pose="captured", material=made), held)
+    youngs_modulus, viscosity = made.youngs_modulus, max(made.viscosity, 1e-3)
+    frames, plate, camera = make_film(truth, made, trouble, seed, moved=moved, dt=dt)
     density = DENSITY * truth.body.volume / thing.body.volume  # the mass is weighed
     clip = Clip(frames=frames, times=np.arange(len(frames)) / 30.0, name=name)
     start, wall = time.process_time(), time.perf_counter()
@@ -66,7 +117,7 @@ def run(name: str, *, trouble: Trouble, anew: bool, verbose: bool) -> tuple[floa
             print(f"   {time.perf_counter() - wall:6.1f} s {stage}", flush=True)
 
     material = Material(poissons_ratio=RATIO, density=density)
-    found, _, x = fit_film(thing, clip, camera, held, material=material, plate=plate, progress=tell)
+    found, _, x = fit_film(thing, clip, camera, held, material=material, plate=plate, progress=tell, device=device)
     seconds = time.process_time() - start
     e, v = found["youngs_modulus"], found["viscosity"]
     if verbose:
@@ -90,13 +141,16 @@ def main() -> None:
     parser.add_argument("names", nargs="*")
     parser.add_argument("--none", action="store_true", help="no trouble")
     parser.add_argument("--same", action="store_true", help="the object of the fit is built from the same mesh")
+    parser.add_argument("--device")
     parser.add_argument("--verbose", action="store_true")
     options = parser.parse_args()
     rows = []
-    for name in options.names or CASES:
+    for name in options.names or (*CASES, *FEM):
         try:
             trouble = NONE if options.none else Trouble()
-            rows.append(run(name, trouble=trouble, anew=not options.same, verbose=options.verbose))
+            rows.append(
+                run(name, trouble=trouble, anew=not options.same, verbose=options.verbose, device=options.device)
+            )
         except SoftmodeError as error:
             print(f"{name:14s} refused: {error}", file=sys.stderr, flush=True)
     if rows:

@@ -49,7 +49,7 @@ class Fit:
     fps_true: float | None = None
     """Frames per second at which a film was taken that plays slower."""
     scene: Path | None = None
-    """JSON file of what the options say: kind, held, fps, mass, density, poissons_ratio, camera, markers, axes, load."""
+    """JSON file: kind, held, fps, mass, density, poissons_ratio, camera, markers, axes, load."""
     press: tuple[float, float, float] | None = None
     """Of a force log: where a ball presses the object on a table, in the axes of its file [m]."""
     radius: float = 0.006
@@ -63,12 +63,17 @@ class Fit:
     toy: Annotated[ObjectOptions, own_group()] = dataclasses.field(default_factory=ObjectOptions)
     """The object: its splats, mesh or preset."""
 
+    @property
+    def twin(self) -> Path:
+        """The file of the twin."""
+        return self.out or Path("out", f"{(self.toy.file or self.file).stem}.npz")
+
     def run(self) -> int:
         """Fit, print, write; return the exit code."""
         toy = self.toy.file
         if toy is None:
             raise ConfigError("no object is given", hint="name its splats or mesh, like --splat toy.ply --size 0.16")
-        out = self.out or Path("out", f"{toy.stem}.npz")
+        out = self.twin
         if out.suffix.lower() != ".npz":
             raise ConfigError(f"out {out} is no .npz file", hint="name it like out/toy.npz")
         check_place(out, "twin")
@@ -158,6 +163,7 @@ class Fit:
                 material=material,
                 plate=None if self.plate is None else clip.like(self.plate),
                 mass_known=known,
+                keep=self.twin.with_suffix(".fit.part.json"),
                 device=device,
                 progress=tell,
             )

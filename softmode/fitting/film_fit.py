@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import functools
+import hashlib
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
+from pathlib import Path
 
 import numpy as np
 import warp as wp
@@ -14,7 +17,8 @@ from softmode.errors import FitError
 from softmode.fitting.estimates import Estimate, Fitted, floor_of
 from softmode.fitting.film import Clip, Image, find_mattes, open_cv
 from softmode.fitting.film_residuals import CAMERA, HOLDER, NAMES, FilmResiduals, film_space
-from softmode.fitting.holding import NAME, Held
+from softmode.fitting.holding import Held
+from softmode.fitting.kept import KeptStages
 from softmode.fitting.least_squares import Solution, Space, cost_of, minimise
 from softmode.fitting.pictures import project
 from softmode.fitting.tracks import follow
@@ -45,6 +49,7 @@ def fit_film(
     material: Material,
     plate: Image | None = None,
     mass_known: bool = True,
+    keep: Path | None = None,
     device: wp.DeviceLike = None,
     progress: Progress | None = None,
 ) -> tuple[Fitted, FilmResiduals, Array]:
@@ -58,6 +63,7 @@ def fit_film(
         material: Density and Poisson's ratio; the rest is where the fit begins.
         plate: The picture without the object, of the film's size.
         mass_known: Whether the density is measured; else only E over density is told.
+        keep: File that keeps the stages that are done until all are; a fit that was cut off goes on with them.
         device: Warp device.
         progress: Told each stage and how far it is, 0..1.
 
@@ -68,6 +74,8 @@ def fit_film(
         FitError: If the film does not show it: nothing moves, the object is another one, the motion is not followed.
     """
     tell = progress or (lambda stage, fraction: None)
+    pixels = hashlib.sha256(clip.frames.tobytes() + clip.times.tobytes() + (b"" if plate is None else plate.tobytes()))
+    kept = KeptStages(keep, pixels.hexdigest(), thing.body.fingerprint, camera, held, material)
     tell("looking at the film", 0.0)
     mattes = find_mattes(clip, plate)
     tracks = follow(clip, mattes.cover)
@@ -80,7 +88,7 @@ def fit_film(
     still = np.unique(np.linspace(0, mattes.release, 3).astype(int))
     residuals.frames = still
     posed = replace(space, mean=np.where(np.arange(15) == 4, clip.times[-1], space.mean), high=np.full(15, np.inf))
-    pose = minimise(residuals, posed, posed.mean, (*_POSE, "edge"), rounds=6).x
+    pose = kept("pose", lambda: minimise(residuals, posed, posed.mean, (*_POSE, "edge"), rounds=6).x)
     mask, overlap = _compared(residuals, pose, mattes.cover[0], held)
     if overlap < OVERLAP:
         what = f"film {clip.name}: only {overlap:.0%} of object and picture overlap before it is let go"
@@ -91,7 +99,7 @@ def fit_film(
     tell("trying stiffnesses", 0.15)
     sets = np.repeat(np.where(np.arange(15) == 4, space.mean, pose)[None], len(SPECIFIC), axis=0)
     sets[:, 0] = np.log(np.array(SPECIFIC) * material.density)
-    costs = cost_of(residuals(sets))
+    costs = kept("costs", lambda: cost_of(residuals(sets)))
     none = sets[:1].copy()
     none[0, 4] = clip.times[-1]
     unmoved = residuals(none)[0]
@@ -99,21 +107,27 @@ def fit_film(
     for k in np.argsort(costs):
         if all(abs(sets[k, 0] - sets[j, 0]) > APART for j in starts) and len(starts) < 2:
             starts.append(int(k))
-    found: list[Solution] = []
     motion = ("youngs_modulus", "viscosity", "start", *_POSE, "edge")
+    tight = replace(space, prior=np.where(np.arange(15) == 1, 0.5, space.prior))
+
+    def refined(space: Space, start: Array, names: Sequence[str]) -> Array:
+        """Return the cost and the parameters near a start."""
+        one = minimise(residuals, space, start, names, rounds=4, lasting=_LASTING)
+        return np.append(one.cost, one.x)
+
+    found: list[Array] = []
     for n, k in enumerate(starts):
         tell("fitting", 0.3 + 0.15 * n)
-        tight = replace(space, prior=np.where(np.arange(15) == 1, 0.5, space.prior))
-        found.append(minimise(residuals, tight, sets[k], motion, rounds=4, lasting=_LASTING))
-    best = min(found, key=lambda one: one.cost)
+        found.append(kept(f"start {n}", functools.partial(refined, tight, sets[k], motion)))
     tell("fitting", 0.6)
-    best = minimise(residuals, space, best.x, NAMES, rounds=4, lasting=_LASTING)
+    x = min(found, key=lambda one: float(one[0]))[1:]
+    x = kept("coverage", functools.partial(refined, space, x, NAMES))[1:]
     tell("fitting with tracks", 0.8)
-    residuals.anchor(tracks, best.x)
-    best = minimise(residuals, space, best.x, NAMES, rounds=6, lasting=_LASTING)
+    residuals.anchor(tracks, x)
+    best = minimise(residuals, space, x, NAMES, rounds=6, lasting=_LASTING)
     followed = _followed(residuals, best.residuals[: residuals.sizes[0]], unmoved)
     tell(
-        f"DEBUG grid {np.round(costs, 1)} unmoved {cost_of(unmoved[None])[0]:.1f} best {best.cost:.1f} followed {followed:.3f} pose {np.round(pose, 4).tolist()} x {np.round(best.x, 4).tolist()} overlap {overlap:.3f} release {mattes.release} pixels {residuals._pixels.sum()} noise {mattes.noise:.2f} starts {[(round(float(np.exp(o.x[0]))), round(o.cost, 1)) for o in found]} dev {best.deviations(residuals.blocks())[:2]}",
+        f"DEBUG grid {np.round(costs, 1)} unmoved {cost_of(unmoved[None])[0]:.1f} best {best.cost:.1f} followed {followed:.3f} pose {np.round(pose, 4).tolist()} x {np.round(best.x, 4).tolist()} overlap {overlap:.3f} release {mattes.release} pixels {residuals._pixels.sum()} noise {mattes.noise:.2f} starts {[(round(float(np.exp(o[1]))), round(float(o[0]), 1)) for o in found]} dev {best.deviations(residuals.blocks())[:2]}",
         0.9,
     )
     if followed < FOLLOWED:
@@ -129,12 +143,13 @@ def fit_film(
         "start": float(best.x[4]),
         "followed": followed,
         "tracks": len(residuals.tracks),
-        "starts": [{"youngs_modulus": float(np.exp(one.x[0])), "cost": one.cost} for one in found],
+        "starts": [{"youngs_modulus": float(np.exp(one[1])), "cost": float(one[0])} for one in found],
         "residual_of_frames": _by_frames(residuals, best),
         "integrator": {"youngs_modulus": float(np.exp(shift[0])), "viscosity": float(np.exp(shift[1]))},
         "world_steps": residuals.worlds.steps,
         "pictures": residuals.pictures.drawn,
     }
+    kept.done()
     tell("done", 1.0)
     return replace(told, details=details), residuals, best.x
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
@@ -22,8 +24,8 @@ NAMES = (
     *("camera_rx", "camera_ry", "camera_rz", "camera_x", "camera_y", "camera_z", "edge"),
     *("holder_x", "holder_y", "holder_z"),
 )
-"""Parameters: logarithms of Young's modulus [Pa] and viscosity [s], turns of gravity [rad], start of motion [s], turn and
-move of the camera in its own axes [rad, m], where the matte ends [px], and where the holder goes at release [m]."""
+"""Parameters: logarithms of Young's modulus [Pa] and viscosity [s], turns of gravity [rad], start of motion [s], turn
+and move of the camera in its own axes [rad, m], where the matte ends [px], where the holder goes at release [m]."""
 PHYSICS, CAMERA, HOLDER = slice(0, 4), slice(5, 11), slice(12, 15)
 STATIC_SHARE = 0.9
 """How much of the mean over time is taken off: what is wrong in every frame is no motion."""
@@ -168,4 +170,4 @@ class FilmResiduals:
         """Return residuals that may err together: of three frames, or of a track."""
         groups = np.array_split(np.arange(self.sizes[0]).reshape(len(self.frames), -1), max(len(self.frames) // 3, 2))
         ends = np.cumsum(self.sizes)
-        return [g.ravel() for g in groups] + [np.arange(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+        return [g.ravel() for g in groups] + [np.arange(a, b) for a, b in itertools.pairwise(ends)]
