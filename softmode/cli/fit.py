@@ -171,7 +171,7 @@ class Fit:
 
     def _film(self, path: Path, residuals: Any, x: Any) -> None:
         """Write the film beside the twin."""
-        from softmode.fitting.fit_film_picture import side_by_side
+        from softmode.fitting.comparison import side_by_side
         from softmode.viz.film import Film
 
         with Film(path) as film:

@@ -17,7 +17,6 @@ from softmode.deformables.solver.solver_reduced import SolverReduced, SolverRedu
 from softmode.errors import ConfigError, FitError
 from softmode.fitting.estimates import Estimate, Fitted, floor_of
 from softmode.fitting.tables import ForceLog
-from softmode.objects.fingerprint import file_fingerprint
 from softmode.objects.frame import file_frame
 from softmode.objects.soft_object import SoftObject
 from softmode.scenes.capture import capture_graph
@@ -175,14 +174,9 @@ def fit_force(
             f"no single E fits: {shallow / 1e3:.3g} kPa when it is pressed a little, {deep / 1e3:.3g} kPa at the end,"
             f" as {law} does"
         )
-    digest = ""
-    from pathlib import Path
-
-    if Path(log.source).is_file():
-        digest = file_fingerprint(Path(log.source))
     return Fitted(
         source=log.source,
-        fingerprint=digest,
+        fingerprint=log.fingerprint,
         estimates={"youngs_modulus": estimate},
         material=replace(material, youngs_modulus=modulus),
         notes=tuple(notes),

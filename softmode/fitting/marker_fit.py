@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import warp as wp
@@ -17,7 +16,6 @@ from softmode.fitting.film_fit import SPECIFIC
 from softmode.fitting.least_squares import Space, cost_of, minimise
 from softmode.fitting.tables import Markers
 from softmode.fitting.worlds import FitWorlds, at_times
-from softmode.objects.fingerprint import file_fingerprint
 from softmode.objects.frame import file_frame
 from softmode.objects.soft_object import SoftObject
 
@@ -227,10 +225,9 @@ def fit_markers(
     estimates["viscosity"] = viscosity
     if viscosity.observable:
         changes["viscosity"] = viscosity.value
-    path = Path(markers.source)
     return Fitted(
         source=markers.source,
-        fingerprint=file_fingerprint(path) if path.is_file() else "",
+        fingerprint=markers.fingerprint,
         estimates=estimates,
         material=replace(material, **changes),
         notes=tuple(notes),

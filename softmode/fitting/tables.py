@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from softmode.errors import AssetError, FitError
 from softmode.files import read_file
+from softmode.objects.fingerprint import file_fingerprint
 
 Array = NDArray[np.float64]
 _LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
@@ -32,6 +33,8 @@ class Markers:
     """Where they are [m], shape (F, M, 3)."""
     source: str = "markers"
     """Their file."""
+    fingerprint: str = ""
+    """Its sha256."""
 
     @property
     def noise(self) -> float:
@@ -115,7 +118,7 @@ def read_markers(path: Path) -> Markers:
         if (jump := int(change.argmax())) >= 0 and change[jump] > max(8.0 * np.sort(step)[-8:].mean(), 5.0e-3):
             what = f"marker file {path}: {name} jumps at {times[jump + 1]:.3g} s"
             raise FitError(what, hint="markers were swapped or renamed there: label them again, or leave it out")
-    return Markers(times=times, names=tuple(names), places=places, source=str(path))
+    return Markers(times=times, names=tuple(names), places=places, source=str(path), fingerprint=file_fingerprint(path))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -130,6 +133,8 @@ class ForceLog:
     """Whether the way is an opening."""
     source: str = "force log"
     """Its file."""
+    fingerprint: str = ""
+    """Its sha256."""
 
 
 def holds_forces(path: Path) -> bool:
@@ -161,7 +166,13 @@ def read_forces(path: Path) -> ForceLog:
         hint = "give columns like depth [mm],force [N], or opening [mm],force [N]"
         raise FitError(f"force log {path}: has columns {', '.join(titles)}", hint=hint)
     good = np.isfinite(columns[way]) & np.isfinite(columns["force"])
-    log = ForceLog(way=columns[way][good], force=columns["force"][good], opening=way == "opening", source=str(path))
+    log = ForceLog(
+        way=columns[way][good],
+        force=columns["force"][good],
+        opening=way == "opening",
+        source=str(path),
+        fingerprint=file_fingerprint(path),
+    )
     if len(log.way) < 4 or not log.force.max() > 0.0 or np.ptp(log.way) == 0.0:
         raise FitError(f"force log {path}: nothing presses", hint="give forces > 0 at four depths or more")
     return log
