@@ -77,7 +77,7 @@ def fem_truth(name: str) -> tuple[Any, Any, Material, int]:
     body = truth.body
     points, weights = body.cubature.points, body.cubature.weights
     shift = shape.bounds[0] - (body.bounds + body.offset)[0]  # the object stands on z = 0 around the origin
-    matrix = solid.mesh.interpolation(np.clip(points + body.offset + shift, *(shape.bounds + [[1e-9], [-1e-9]])))
+    matrix = solid.mesh.interpolation(np.clip(points + body.offset + shift, *np.add(shape.bounds, [[1e-9], [-1e-9]])))
     q = np.array([body.fit(matrix @ u, points, weights) for u in moved[::2]])
     _, model = motion(truth, made, 0.01, 1.0 / 480.0)
     return first, (truth, (q, model)), made, seed
@@ -128,7 +128,7 @@ def run(
         f"{name:14s} E {youngs_modulus / 1e3:5.0f} kPa: ln error {out[0]:+.3f} +- {out[1]:.3f}"
         f"{'' if e.observable else ' (not observable)'}; viscosity {1e3 * viscosity:.1f} ms:"
         f" {more[0]:+.2f} +- {more[1]:.2f}; followed {found.details['followed']:.3f}, {found.details['tracks']} tracks;"
-        f" integrator {found.details['integrator']['viscosity']:.2f} {found.details['integrator']['youngs_modulus']:.3f};"
+        f" integrator {' '.join(f'{v:.3f}' for v in found.details['integrator'].values())};"
         f" volume {thing.body.volume / truth.body.volume:.3f}; {seconds:.0f} s",
         flush=True,
     )
