@@ -126,10 +126,6 @@ def fit_film(
     residuals.anchor(tracks, x)
     best = minimise(residuals, space, x, NAMES, rounds=6, lasting=_LASTING)
     followed = _followed(residuals, best.residuals[: residuals.sizes[0]], unmoved)
-    tell(
-        f"DEBUG grid {np.round(costs, 1)} unmoved {cost_of(unmoved[None])[0]:.1f} best {best.cost:.1f} followed {followed:.3f} pose {np.round(pose, 4).tolist()} x {np.round(best.x, 4).tolist()} overlap {overlap:.3f} release {mattes.release} pixels {residuals._pixels.sum()} noise {mattes.noise:.2f} starts {[(round(float(np.exp(o[1]))), round(float(o[0]), 1)) for o in found]} dev {best.deviations(residuals.blocks())[:2]}",
-        0.9,
-    )
     if followed < FOLLOWED:
         what = f"film {clip.name}: not observable, because the twin follows {followed:.0%} of what moves"
         raise FitError(what, hint="film one object that is held by one end and let go, before a background at rest")
@@ -144,6 +140,8 @@ def fit_film(
         "followed": followed,
         "tracks": len(residuals.tracks),
         "starts": [{"youngs_modulus": float(np.exp(one[1])), "cost": float(one[0])} for one in found],
+        "costs": {"at_rest": float(cost_of(unmoved[None])[0]), "tried": np.round(costs, 3).tolist(), "end": best.cost},
+        "overlap": overlap,
         "residual_of_frames": _by_frames(residuals, best),
         "integrator": {"youngs_modulus": float(np.exp(shift[0])), "viscosity": float(np.exp(shift[1]))},
         "world_steps": residuals.worlds.steps,
