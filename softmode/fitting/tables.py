@@ -16,6 +16,8 @@ from softmode.files import read_file
 from softmode.objects.fingerprint import file_fingerprint
 
 Array = NDArray[np.float64]
+SHAKEN = 5
+"""Frames for which a marker is away from its place once it is let go."""
 _LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
 _FORCES = {"N": 1.0, "mN": 1e-3, "kN": 1e3, "gf": 9.80665e-3, "kgf": 9.80665}
 _TITLE = re.compile(r"\s*([A-Za-z]+)[\s_]*[\[(]?\s*([A-Za-z]*)\s*[\])]?\s*")
@@ -68,8 +70,8 @@ class Markers:
             hint = "let the object go, or hang a weight on it"
             raise FitError(f"{self.source}: not observable, because no marker moves", hint=hint)
         moved = away > max(10.0 * self.noise, 0.02 * away.max())
-        still = np.flatnonzero(~moved[: int(away.argmax()) + 1])  # a hand may shake it a little before
-        return int(still[-1]) if len(still) else 0
+        lasting = np.convolve(moved, np.ones(SHAKEN), "valid") == SHAKEN  # a hand may shake it a little before
+        return max(int(lasting.argmax()) - 1, 0)
 
 
 def _rows(path: Path, what: str) -> tuple[list[str], Array]:
