@@ -14,7 +14,7 @@ from softmode.fitting.film import Clip, Mattes, open_cv
 from softmode.fitting.least_squares import Space
 from softmode.fitting.pictures import CoverPictures, project
 from softmode.fitting.tracks import Track
-from softmode.fitting.worlds import FitWorlds, at_times
+from softmode.fitting.worlds import FitWorlds
 from softmode.objects.soft_object import SoftObject
 from softmode.splats.raster.pinhole import PinholeCamera
 
@@ -100,17 +100,7 @@ class FilmResiduals:
 
     def states(self, sets: Array) -> Array:
         """Return coordinates of parameters (W, p) in the frames, shape (W, F, n, 3)."""
-        times = self.clip.times[self.frames]
-        physics, which = np.unique(sets[:, PHYSICS], axis=0, return_inverse=True)
-        seconds = max(float(times.max() - sets[:, 4].min()), 0.0) + 4.0 * self.worlds.dt
-        found = []
-        for first in range(0, len(physics), self.worlds.count):
-            some = physics[first : first + self.worlds.count]
-            given = {"youngs_modulus": np.exp(some[:, 0]), "viscosity": np.exp(some[:, 1])}
-            at, q = self.worlds.run(given, seconds, tilt=some[:, 2:4])
-            found.append(q)
-        whole = np.concatenate(found, axis=1)
-        return np.array([at_times(at, whole[:, k], times - x[4]) for k, x in zip(which.ravel(), sets, strict=True)])
+        return self.worlds.states(sets[:, PHYSICS], sets[:, 4], self.clip.times[self.frames])
 
     def poses(self, sets: Array) -> Array:
         """Return from the world to the camera, with what the holder does, shape (W, F, 4, 4)."""

@@ -15,12 +15,12 @@ from softmode.fitting.estimates import Estimate, Fitted
 from softmode.fitting.film_fit import SPECIFIC
 from softmode.fitting.least_squares import Space, cost_of, minimise
 from softmode.fitting.tables import Markers
-from softmode.fitting.worlds import FitWorlds, at_times
+from softmode.fitting.worlds import FitWorlds
 from softmode.objects.frame import file_frame
 from softmode.objects.soft_object import SoftObject
 
 Array = NDArray[np.float64]
-NAMES = ("youngs_modulus", "viscosity", "start", "tilt_x", "tilt_y")
+NAMES = ("youngs_modulus", "viscosity", "tilt_x", "tilt_y", "start")
 REST = 1.0
 """Last part of a take in which the object has to hang still, for its sag [s]."""
 STILL = 0.02
@@ -147,27 +147,18 @@ class MarkerFit:
         times, noise = markers.times[frames], max(markers.noise, 2.0e-4)
         worlds = FitWorlds(self.thing.body, self.material, 5, dt=self._dt, load=self._load, device=self._device)
         interval = float(np.median(np.diff(markers.times)))
-        wide = np.full(5, np.inf)
         space = Space(
             names=NAMES,
-            mean=np.array([np.log(300.0 * self.material.density), np.log(4e-3), release, 0.0, 0.0]),
-            prior=np.array([3.0, 1.5, 2.0 * interval, 0.035, 0.035]),
-            step=np.array([0.02, 0.1, 0.002, 0.01, 0.01]),
-            low=np.array([np.log(3.0 * self.material.density), np.log(1e-4), release - 0.05, -0.3, -0.3]),
-            high=np.where(np.arange(5) == 2, release + 0.05, wide),
+            mean=np.array([np.log(300.0 * self.material.density), np.log(4e-3), 0.0, 0.0, release]),
+            prior=np.array([3.0, 1.5, 0.035, 0.035, 2.0 * interval]),
+            step=np.array([0.02, 0.1, 0.01, 0.01, 0.002]),
+            low=np.array([np.log(3.0 * self.material.density), np.log(1e-4), -0.3, -0.3, release - 0.05]),
+            high=np.array([*[np.inf] * 4, release + 0.05]),
         )
 
         def residuals(sets: Array) -> Array:
-            physics, which = np.unique(sets[:, [0, 1, 3, 4]], axis=0, return_inverse=True)
-            seconds, found = float(times[-1] - sets[:, 2].min()) + 4.0 * self._dt, []
-            for first in range(0, len(physics), 5):
-                part = physics[first : first + 5]
-                given = {"youngs_modulus": np.exp(part[:, 0]), "viscosity": np.exp(part[:, 1])}
-                at, q = worlds.run(given, seconds, tilt=part[:, 2:])
-                found.append(np.einsum("mk,twkc->twmc", self._basis, q - q[0]))
-            x = np.concatenate(found, axis=1)
-            pairs = zip(which.ravel(), sets, strict=True)
-            return np.array([((at_times(at, x[:, k], times - s[2]) - moved[frames]) / noise).ravel() for k, s in pairs])
+            q = worlds.states(sets[:, :4], sets[:, 4], times)  # zero at rest
+            return ((np.einsum("mk,wtkc->wtmc", self._basis, q) - moved[frames]) / noise).reshape(len(sets), -1)
 
         starts = np.repeat(space.mean[None], len(SPECIFIC), axis=0)
         starts[:, 0] = np.log(np.array(SPECIFIC) * self.material.density)
@@ -231,5 +222,5 @@ def fit_markers(
         estimates=estimates,
         material=replace(material, **changes),
         notes=tuple(notes),
-        details={"start": float(x[2]), "rms": left},
+        details={"start": float(x[4]), "rms": left},
     )

@@ -116,6 +116,24 @@ class FitWorlds:
             raise SolverDiverged("a world of the fit is no longer finite", hint="narrow the range of Young's modulus")
         return np.arange(count + 1) * self.dt * every, found
 
+    def states(self, sets: Array, starts: Array, times: Array) -> Array:
+        """Return coordinates at times [s], shape (W, F, n, 3), of any number of sets of parameters.
+
+        Args:
+            sets: Logarithms of Young's modulus [Pa] and viscosity [s], and the tilt [rad], shape (W, 4).
+            starts: When each is let go [s], shape (W,).
+            times: Times (F,) [s].
+        """
+        some, which = np.unique(sets, axis=0, return_inverse=True)
+        seconds, found = max(float(times.max() - starts.min()), 0.0) + 4.0 * self.dt, []
+        for first in range(0, len(some), self.count):
+            part = some[first : first + self.count]
+            given = {"youngs_modulus": np.exp(part[:, 0]), "viscosity": np.exp(part[:, 1])}
+            at, q = self.run(given, seconds, tilt=part[:, 2:])
+            found.append(q)
+        whole = np.concatenate(found, axis=1)
+        return np.array([at_times(at, whole[:, k], times - t) for k, t in zip(which.ravel(), starts, strict=True)])
+
     def _two_steps(self) -> None:
         """Launch two steps, which end where they began."""
         for a, b in (self._states, self._states[::-1]):
