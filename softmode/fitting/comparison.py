@@ -8,14 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softmode.fitting.film_residuals import FilmResiduals
-from softmode.fitting.pictures import project
 
 SCALE = 2
 """Pixels of a picture for one of the film's."""
 
 
 def side_by_side(residuals: FilmResiduals, x: NDArray[np.float64]) -> Iterator[NDArray[np.uint8]]:
-    """Yield a picture for each frame: the film with its tracks, the twin, and their difference in coverage.
+    """Yield a picture for each frame: the film, the twin, and their difference in coverage.
 
     Args:
         residuals: What the film was fitted with.
@@ -31,15 +30,5 @@ def side_by_side(residuals: FilmResiduals, x: NDArray[np.float64]) -> Iterator[N
         twin = np.clip(255.0 * colors[k] + (1.0 - alpha[k]) * (0.4 * back + 90.0), 0.0, 255.0)
         off = np.clip(alpha[k, ..., 0] - residuals.cover[k], -1.0, 1.0)
         difference = 255.0 * np.stack([np.maximum(off, 0.0), 0.0 * off, np.maximum(-off, 0.0)], axis=-1)
-        shown = frame.copy()
-        for track, splat in residuals.tracks:
-            if k in track.frames:
-                point = residuals.thing.visible_splats.means[splat] + residuals.thing.basis[splat] @ q[k]
-                for place, color in (
-                    (track.places[int(np.flatnonzero(track.frames == k)[0])], (255, 255, 255)),
-                    (project(residuals.camera, poses[k], point)[0], (255, 0, 0)),
-                ):
-                    column, row = np.clip(place, 0, np.array(frame.shape[1::-1]) - 1).astype(int)
-                    shown[row, column] = color
-        picture = np.concatenate([shown, twin.astype(np.uint8), difference.astype(np.uint8)], axis=1)
+        picture = np.concatenate([frame, twin.astype(np.uint8), difference.astype(np.uint8)], axis=1)
         yield picture.repeat(SCALE, axis=0).repeat(SCALE, axis=1)

@@ -256,11 +256,12 @@ def integrator_shift(
     """
     rows = thing.body.surface.basis[:: max(1, thing.body.surface_count // 60)]
 
+    times = np.arange(0.0, seconds, 4.0 * dt)
+
     def motion(sets: Array, step: float) -> Array:
         worlds = FitWorlds(thing.body, material, len(sets), dt=step, device=device)
-        given = {"youngs_modulus": np.exp(sets[:, 0]), "viscosity": np.exp(sets[:, 1])}
-        q = worlds.run(given, seconds, tilt=sets[:, 2:4], every=2 * round(dt / step))[1]
-        return np.einsum("sk,twkc->wtsc", rows, q).reshape(len(sets), -1)
+        q = worlds.states(sets, np.zeros(len(sets)), times)
+        return np.einsum("sk,wtkc->wtsc", rows, q).reshape(len(sets), -1)
 
     sets = np.repeat(x[None, :4], 3, axis=0)
     steps = np.array([0.02, 0.1])

@@ -53,22 +53,16 @@ class Press:
         add_reduced_body(world, body, material=material)
         press = world.add_body(is_kinematic=True, xform=wp.transform((0.0, 0.0, 10.0 * wide), wp.quat_identity()))
         config = newton.ModelBuilder.ShapeConfig(mu=1.0)
+        plate = {"hx": wide, "hy": wide, "hz": wide, "cfg": config}
+        axis = np.eye(3)[2 if self.between is None else self.between]
+        behind = 0.5 * (low + high) - axis * (0.5 * float((high - low) @ axis) + wide)
+        world.add_shape_box(-1, xform=wp.transform(tuple(behind), wp.quat_identity()), **plate)
         if self.between is None:
             start, toward = self._contact(body)
             world.add_shape_sphere(press, radius=self.radius, cfg=config)
-            world.add_shape_box(
-                -1, xform=wp.transform((0.0, 0.0, low[2] - wide), wp.quat_identity()), hx=wide, hy=wide, hz=wide,
-                cfg=config,
-            )  # fmt: skip
         else:
-            axis = np.eye(3)[self.between]
-            middle = 0.5 * (low + high)
-            start, toward = middle + axis * (0.5 * (high - low)[self.between] + wide), -axis
-            other = middle - axis * (0.5 * (high - low)[self.between] + wide)
-            world.add_shape_box(press, hx=wide, hy=wide, hz=wide, cfg=config)
-            world.add_shape_box(
-                -1, xform=wp.transform(tuple(other), wp.quat_identity()), hx=wide, hy=wide, hz=wide, cfg=config
-            )
+            start, toward = low + high - behind, -axis
+            world.add_shape_box(press, **plate)
         builder.replicate(world, len(depths))
         model = builder.finalize(device=device)
         if self.between is not None:
