@@ -21,7 +21,6 @@ FLOOR = 0.03
 """Least standard deviation of ln E: bodies that were filled anew from 12,000 splats were off by it (median 2.4 %)."""
 CERTAIN = 0.35
 """Standard deviation of a logarithm above which a parameter is not observable."""
-_UNITS = {"youngs_modulus": "Pa", "viscosity": "s", "youngs_modulus_over_density": "m^2/s^2"}
 
 
 @dataclass(frozen=True, kw_only=True)

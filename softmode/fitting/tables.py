@@ -117,7 +117,7 @@ def read_markers(path: Path) -> Markers:
             raise FitError(what, hint="fill its gaps in the motion capture, or leave the marker out")
         step = np.linalg.norm(np.diff(places[:, k], axis=0), axis=1)
         change = np.abs(np.diff(step, append=step[-1:]))
-        if (jump := int(change.argmax())) >= 0 and change[jump] > max(8.0 * np.sort(step)[-8:].mean(), 5.0e-3):
+        if (jump := int(change.argmax())) >= 0 and change[jump] > max(4.0 * np.sort(step)[-4], 3.0e-3):
             what = f"marker file {path}: {name} jumps at {times[jump + 1]:.3g} s"
             raise FitError(what, hint="markers were swapped or renamed there: label them again, or leave it out")
     return Markers(times=times, names=tuple(names), places=places, source=str(path), fingerprint=file_fingerprint(path))
