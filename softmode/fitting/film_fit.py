@@ -73,7 +73,14 @@ def fit_film(
     Raises:
         FitError: If the film does not show it: nothing moves, the object is another one, the motion is not followed.
     """
-    tell = progress or (lambda stage, fraction: None)
+    done: tuple[str, float] = ("", 0.0)
+
+    def tell(stage: str, fraction: float) -> None:
+        nonlocal done
+        done = (stage, fraction)
+        if progress is not None:
+            progress(stage, fraction)
+
     pixels = hashlib.sha256(clip.frames.tobytes() + clip.times.tobytes() + (b"" if plate is None else plate.tobytes()))
     kept = KeptStages(keep, pixels.hexdigest(), thing.body.fingerprint, camera, held, material)
     tell("looking at the film", 0.0)
@@ -81,6 +88,7 @@ def fit_film(
     tracks = follow(clip, mattes.cover)
     placed = replace(camera, position=tuple(np.subtract(camera.position, thing.body.offset).tolist()))
     residuals = FilmResiduals(thing, material, clip, mattes, placed, device=device)
+    residuals.after = lambda: tell(done[0], min(done[1] + 0.01, 0.99))
     every, release = residuals.frames, float(clip.times[mattes.release])
     space = film_space(release - 0.25 * clip.interval, clip.interval, material.density)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 
 import numpy as np
 import warp as wp
@@ -76,6 +77,8 @@ class FilmResiduals:
         self.thing, self.camera, self.clip = thing, camera, clip
         self.worlds = FitWorlds(thing.body, material, worlds, dt=dt, device=device)
         self.pictures = CoverPictures(thing, camera, device=device)
+        self.after: Callable[[], None] = lambda: None
+        """Called after each batch."""
         self.tracks: list[tuple[Track, int]] = []
         """Tracks that are compared, with the splat of each."""
         self.frames = np.arange(len(clip.times))
@@ -127,6 +130,7 @@ class FilmResiduals:
             r = r - STATIC_SHARE * r.mean(axis=1, keepdims=True)
         out = [r.reshape(count, -1) / COVER_NOISE, *self._track_residuals(q, poses)]
         self.sizes = [part.shape[1] for part in out]
+        self.after()
         return np.concatenate(out, axis=1)
 
     def _track_residuals(self, q: Array, poses: Array) -> list[Array]:
