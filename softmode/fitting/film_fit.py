@@ -30,8 +30,6 @@ Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 SPECIFIC = (8.0, 20.0, 50.0, 120.0, 300.0, 750.0, 1900.0, 4700.0, 12000.0, 30000.0)
 """Young's modulus over density of the starts [m^2/s^2]."""
-APART = 0.3
-"""Least difference of ln E between two starts that are refined."""
 OVERLAP = 0.7
 """Least overlap of object and matte before anything moves, intersection over union."""
 FOLLOWED = 0.6
@@ -111,10 +109,6 @@ def fit_film(
     none = sets[:1].copy()
     none[0, 4] = clip.times[-1]
     unmoved = residuals(none)[0]
-    starts: list[int] = []
-    for k in np.argsort(costs):
-        if all(abs(sets[k, 0] - sets[j, 0]) > APART for j in starts) and len(starts) < 2:
-            starts.append(int(k))
     motion = ("youngs_modulus", "viscosity", "start", *_POSE, "edge")
     tight = replace(space, prior=np.where(np.arange(15) == 1, 0.5, space.prior))
 
@@ -124,7 +118,7 @@ def fit_film(
         return np.append(one.cost, one.x)
 
     found: list[Array] = []
-    for n, k in enumerate(starts):
+    for n, k in enumerate(np.argsort(costs)[:2]):
         tell("fitting", 0.3 + 0.15 * n)
         found.append(kept(f"start {n}", functools.partial(refined, tight, sets[k], motion)))
     tell("fitting", 0.6)
@@ -133,7 +127,8 @@ def fit_film(
     tell("fitting with tracks", 0.8)
     residuals.anchor(tracks, x)
     best = minimise(residuals, space, x, NAMES, rounds=6, lasting=_LASTING)
-    followed = _followed(residuals, best.residuals[: residuals.sizes[0]], unmoved)
+    cover = best.residuals[: residuals.sizes[0]]
+    followed = _followed(cover.reshape(len(every), -1), unmoved)
     if followed < FOLLOWED:
         what = f"film {clip.name}: not observable, because the twin follows {followed:.0%} of what moves"
         raise FitError(what, hint="film one object that is held by one end and let go, before a background at rest")
@@ -150,7 +145,7 @@ def fit_film(
         "starts": [{"youngs_modulus": float(np.exp(one[1])), "cost": float(one[0])} for one in found],
         "costs": {"at_rest": float(cost_of(unmoved[None])[0]), "tried": np.round(costs, 3).tolist(), "end": best.cost},
         "overlap": overlap,
-        "residual_of_frames": _by_frames(residuals, best),
+        "residual_of_frames": np.round(np.sqrt((cover.reshape(len(every), -1) ** 2).mean(axis=1)), 4).tolist(),
         "integrator": {"youngs_modulus": float(np.exp(shift[0])), "viscosity": float(np.exp(shift[1]))},
         "world_steps": residuals.worlds.steps,
         "pictures": residuals.pictures.drawn,
@@ -222,29 +217,21 @@ def _compared(residuals: FilmResiduals, x: Array, cover: Array, held: Held) -> t
     return (~away).astype(np.float64), float(both.sum() / max(one.sum(), 1))
 
 
-def _followed(residuals: FilmResiduals, left: Array, unmoved: Array) -> float:
+def _followed(r: Array, unmoved: Array) -> float:
     """Return how much of what moves the twin follows, 0..1.
 
     What is left holds noise, which is new in each frame, and what is not followed, which is not: the correlation
     between frames tells them apart.
 
     Args:
-        residuals: What the film was fitted with.
-        left: Residuals of the coverage that are left (M,).
-        unmoved: Those of a twin that stays at rest (M,).
+        r: Residuals of the coverage that are left, by frames (F, M).
+        unmoved: Those of a twin that stays at rest (F M,).
     """
-    r = left.reshape(len(residuals.frames), -1)
+    before, after = cost_of(np.stack([unmoved, r.ravel()]))
     r = r - r.mean(axis=0)
     alike = max(abs(float((r[k:] * r[:-k]).sum())) for k in (1, 2)) / max(float((r * r).sum()), 1e-12)
-    before, after = cost_of(unmoved[None])[0], cost_of(left[None])[0]
     signal = max(float(before - after), 0.0)
     return signal / max(signal + alike * float(after), 1e-12)
-
-
-def _by_frames(residuals: FilmResiduals, best: Solution) -> list[float]:
-    """Return the root mean square of the coverage's residual in each frame."""
-    cover = best.residuals[: residuals.sizes[0]].reshape(len(residuals.frames), -1)
-    return np.round(np.sqrt((cover**2).mean(axis=1)), 4).tolist()
 
 
 def first_frequency(thing: SoftObject, youngs_modulus: float, material: Material) -> float:
