@@ -12,7 +12,6 @@ import numpy as np
 
 from softmode import __version__
 from softmode.deformables.materials.material import Material
-from softmode.errors import FitError
 from softmode.files import PendingFile
 from softmode.objects.object_file import write_object
 from softmode.objects.soft_object import SoftObject
@@ -67,13 +66,7 @@ class Fitted:
     """Camera, start, residual of each frame, costs: as JSON holds them."""
 
     def __getitem__(self, name: str) -> Estimate:
-        """Return an estimate.
-
-        Raises:
-            FitError: If there is none of that name.
-        """
-        if name not in self.estimates:
-            raise FitError(f"{name} was not fitted", hint=f"use one of {', '.join(self.estimates)}")
+        """Return an estimate."""
         return self.estimates[name]
 
     @property

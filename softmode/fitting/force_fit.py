@@ -8,6 +8,7 @@ import newton
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
 from scipy.optimize import least_squares
 
 from softmode.deformables.body.reduced_body import ReducedBody
@@ -26,6 +27,8 @@ DEPTHS = 8
 """Depths that are simulated, a world each."""
 STEP, RAMP, REST = 0.01, 40, 40
 """Step [s], steps while it presses, and steps until it lies still."""
+BALL = 0.12
+"""Standard deviation of ln E that the contact of a ball leaves: against Hertz's law."""
 FOAM = 0.15
 """Relative change of E over the depth from which on one E does not fit."""
 
@@ -112,6 +115,12 @@ class Press:
         return point + normal * float(reach.max()), -normal
 
 
+def _curve(depths: Array, forces: Array, wanted: Array) -> Array:
+    """Return forces at wanted depths, by monotone cubics through none and those at some depths."""
+    curve = PchipInterpolator(np.append(0.0, depths), np.append(0.0, forces))
+    return curve(np.clip(wanted, 0.0, depths[-1]))
+
+
 def fit_force(
     thing: SoftObject, log: ForceLog, press: Press, *, material: Material, device: wp.DeviceLike = None
 ) -> Fitted:
@@ -146,8 +155,9 @@ def fit_force(
         slack = 0.03 * float(way.max())
 
         def residuals(x: Array, made: Array = made, modulus: float = modulus, slack: float = slack) -> Array:
-            curve = np.interp(way - x[1], np.append(0.0, depths), np.append(0.0, made))
-            return np.append((np.exp(x[0]) / modulus * curve - force) / (0.03 * force.max()), x[1] / slack)
+            return np.append(
+                (np.exp(x[0]) / modulus * _curve(depths, made, way - x[1]) - force) / (0.03 * force.max()), x[1] / slack
+            )
 
         found = least_squares(residuals, [np.log(modulus), shift], x_scale=[0.1, slack])
         before, modulus, shift = modulus, float(np.exp(found.x[0])), float(found.x[1])
@@ -155,8 +165,10 @@ def fit_force(
             break
     inverse = np.linalg.inv(found.jac.T @ found.jac)
     spread = float(np.sqrt(inverse[0, 0] * max(2.0 * found.cost / max(len(way) - 2, 1), 0.1)))
-    estimate = Estimate.of_logarithm(np.log(modulus), float(np.hypot(spread, floor_of(thing))), unit="Pa")
-    curve = np.interp(way - shift, np.append(0.0, depths), np.append(0.0, made)) * modulus / before
+    estimate = Estimate.of_logarithm(
+        np.log(modulus), float(np.hypot(spread, floor_of(thing) if press.point is None else BALL)), unit="Pa"
+    )
+    curve = _curve(depths, made, way - shift) * modulus / before
     shallow, deep = (
         modulus * float(force[part].sum() / max(curve[part].sum(), 1e-12))
         for part in ((way > 0.2 * way.max()) & (way < 0.5 * way.max()), way > 0.75 * way.max())

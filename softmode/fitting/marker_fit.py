@@ -37,11 +37,11 @@ class MarkerPlaces:
 
     points: Mapping[str, Sequence[float]]
     """Places of markers on the object at rest, in the axes of its file [m]; others are not used."""
-    axes: tuple[str, str, str] = ("+x", "+y", "+z")
+    axes: Sequence[str] = ("+x", "+y", "+z")
     """Which axes of the markers' file are x, y and z of the object's."""
-    load: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    load: Sequence[float] = (0.0, 0.0, 0.0)
     """Force that hangs on it, in the axes of the object's file [N]."""
-    load_at: tuple[float, float, float] | None = None
+    load_at: Sequence[float] | None = None
     """Where."""
 
     @property

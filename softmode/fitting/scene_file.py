@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -40,7 +41,7 @@ class FitScene:
     the file."""
     markers: dict[str, list[float]] = field(default_factory=dict)
     """Places of markers on the object."""
-    axes: tuple[str, str, str] = ("+x", "+y", "+z")
+    axes: Sequence[str] = ("+x", "+y", "+z")
     """Axes of the markers' file that are the object's."""
     load: dict[str, list[float]] = field(default_factory=dict)
     """``force`` [N] that hangs on it, and ``at`` [m]."""
@@ -76,12 +77,7 @@ class FitScene:
         given = {name: value for name, value in options.items() if value is not None}
         if "mass" in given or "density" in given:
             told = {name: value for name, value in told.items() if name not in ("mass", "density")}
-        made = {**told, **given}
-        made["axes"] = tuple(made.get("axes", cls.axes))
-        try:
-            return cls(**made)
-        except TypeError as error:
-            raise ConfigError(f"scene file {path}: {error}", hint=f"use {', '.join(known)}") from error
+        return cls(**{**told, **given})
 
     def density_of(self, volume: float) -> tuple[float, bool]:
         """Return the density [kg/m^3] of an object of a volume [m^3], and whether it was told."""
@@ -95,12 +91,7 @@ class FitScene:
         require_numbers("load force", force, 3)
         for name, point in self.markers.items():
             require_numbers(f"marker {name}", point, 3)
-        return MarkerPlaces(
-            points=self.markers,
-            axes=self.axes,
-            load=tuple(force),  # type: ignore[arg-type]
-            load_at=None if at is None else tuple(at),  # type: ignore[arg-type]
-        )
+        return MarkerPlaces(points=self.markers, axes=self.axes, load=force, load_at=at)
 
     def pinhole(self, width: int, height: int, shrink: float) -> PinholeCamera:
         """Return the camera for frames of a size [px] that are a file's made smaller.
@@ -118,12 +109,10 @@ class FitScene:
                 require_numbers(f"camera {name}", told[name], count, hint=hint)
         size, place = {"width": width, "height": height}, tuple(told["position"])
         fov = float(told.get("fov_y", 0.8))
-        if "target" in told:
-            camera = PinholeCamera.look_at("film", position=place, target=tuple(told["target"]), fov_y=fov, **size)
-        else:
-            focal = 0.5 * height / float(np.tan(0.5 * fov))
-            matrix = np.array([[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]])
-            camera = PinholeCamera.from_matrix("film", matrix, position=place, quat=tuple(told["quat"]), **size)
+        target = told.get("target", np.add(place, (0.0, 1.0, 0.0)))
+        camera = PinholeCamera.look_at("film", position=place, target=target, fov_y=fov, **size)
+        if "quat" in told:
+            camera = replace(camera, quat=tuple(told["quat"]))
         if "matrix" in told:
             k = np.asarray(told["matrix"], float) * shrink
             camera = replace(camera, fx=k[0, 0], fy=k[1, 1], cx=k[0, 2], cy=k[1, 2])
