@@ -13,7 +13,7 @@ from softmode.files import check_place
 
 if TYPE_CHECKING:
     from softmode.fitting.estimates import Fitted
-    from softmode.fitting.scene_file import FitScene
+    from softmode.cli.fit_scene import FitScene
     from softmode.objects.soft_object import SoftObject
 
 
@@ -79,7 +79,7 @@ class Fit:
         check_place(out, "twin")
         if self.toy.density is not None and self.mass is not None:
             raise ConfigError("--mass and --density are given", hint="give one of them")
-        from softmode.fitting.scene_file import FitScene
+        from softmode.cli.fit_scene import FitScene
 
         scene = FitScene.read(
             self.scene,

@@ -145,8 +145,6 @@ class Mattes:
     """Standard deviation of the film's noise, of 255."""
     release: int
     """The last frame before anything moves."""
-    mask: Array
-    """1 where the film is compared, 0 on what is not the object, shape (H, W)."""
 
 
 def find_mattes(clip: Clip, plate: Image | None) -> Mattes:
@@ -181,7 +179,7 @@ def find_mattes(clip: Clip, plate: Image | None) -> Mattes:
     edge[2:-2, 2:-2] = False
     if (cover[release:, edge] > 0.5).sum(axis=1).max() > (cover[0, edge] > 0.5).sum() + 6:
         raise FitError(f"film {clip.name}: the object leaves the picture", hint="film it from farther away")
-    return Mattes(cover=cover, noise=noise, release=release, mask=np.ones(cover.shape[1:]))
+    return Mattes(cover=cover, noise=noise, release=release)
 
 
 def _solid(cover: Array) -> Array:

@@ -86,7 +86,7 @@ class FilmResiduals:
         self.moving = False
         """Whether most of the mean over time is taken off."""
         self.cover = mattes.cover
-        self.mask(mattes.mask)
+        self.mask(np.ones(mattes.cover.shape[1:]))
 
     def mask(self, mask: Array) -> None:
         """Compare pixels where a mask (H, W) is 1, and near the object."""
