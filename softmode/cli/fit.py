@@ -12,8 +12,8 @@ from softmode.errors import ConfigError
 from softmode.files import check_place
 
 if TYPE_CHECKING:
-    from softmode.fitting.estimates import Fitted
     from softmode.cli.fit_scene import FitScene
+    from softmode.fitting.estimates import Fitted
     from softmode.objects.soft_object import SoftObject
 
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from softmode.cli.fit_scene import FitScene
 from softmode.errors import AssetError, ConfigError, FitError
 from softmode.fitting.film import Clip, find_mattes
 from softmode.fitting.holding import Held
-from softmode.cli.fit_scene import FitScene
 from softmode.viz.film import Film
 
 cv2 = pytest.importorskip("cv2")
