@@ -161,7 +161,7 @@ def fit_force(
 
         found = least_squares(residuals, [np.log(modulus), shift], x_scale=[0.1, slack])
         before, modulus, shift = modulus, float(np.exp(found.x[0])), float(found.x[1])
-        if abs(np.log(modulus / before)) < 0.02:
+        if axis is not None or abs(np.log(modulus / before)) < 0.02:  # without weight forces go with E
             break
     inverse = np.linalg.inv(found.jac.T @ found.jac)
     spread = float(np.sqrt(inverse[0, 0] * max(2.0 * found.cost / max(len(way) - 2, 1), 0.1)))

@@ -59,7 +59,7 @@ def test_film(tmp_path: Path) -> None:
     assert again.material is not None and again.material.youngs_modulus == pytest.approx(modulus.value)
     assert json.loads(str(again.body.provenance["fit_bars"]))["youngs_modulus"] == [modulus.low, modulus.high]
     with pytest.raises(FitError, match="overlap"):
-        aside = replace(camera, position=(camera.position[0] + 0.2, *camera.position[1:]))
+        aside = replace(camera, position=(camera.position[0] + 1.0, *camera.position[1:]))
         fit_film(thing, clip, aside, HELD, material=unknown, plate=plate)
 
 
