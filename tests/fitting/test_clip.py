@@ -12,8 +12,9 @@ from softmode.errors import AssetError, ConfigError, FitError
 from softmode.fitting.film import Clip, find_mattes
 from softmode.fitting.holding import Held
 from softmode.viz.film import Film
+from tests.needs import needs
 
-cv2 = pytest.importorskip("cv2")
+pytestmark = needs("cv2")
 Frames = np.ndarray
 
 

@@ -23,8 +23,9 @@ from softmode.fitting.least_squares import Space, minimise
 from softmode.objects import SoftObject, load
 from softmode.splats.colored_mesh import ColoredMesh
 from tests.fitting.films import Trouble, make_film
+from tests.needs import needs
 
-pytest.importorskip("cv2")
+pytestmark = needs("cv2")
 TRUE = Material(youngs_modulus=9.0e4, viscosity=5.0e-3, poissons_ratio=0.35, density=300.0)
 HELD = Held.parse("-x:0.03")
 
