@@ -23,6 +23,8 @@ from softmode.objects.soft_object import SoftObject
 from softmode.scenes.capture import capture_graph
 
 Array = NDArray[np.float64]
+START = 1.0e5
+"""Young's modulus of the run [Pa]: without weight, forces go with it."""
 DEPTHS = 8
 """Depths that are simulated, a world each."""
 STEP, RAMP, REST = 0.01, 40, 40
@@ -53,7 +55,7 @@ class Press:
         low, high = body.surface.points.min(axis=0), body.surface.points.max(axis=0)
         wide = 2.0 * float((high - low).max())
         world, builder = newton.ModelBuilder(), newton.ModelBuilder()
-        add_reduced_body(world, body, material=material)
+        add_reduced_body(world, body, material=replace(material, mass_damping=20.0))
         press = world.add_body(is_kinematic=True, xform=wp.transform((0.0, 0.0, 10.0 * wide), wp.quat_identity()))
         config = newton.ModelBuilder.ShapeConfig(mu=1.0)
         plate = {"hx": wide, "hy": wide, "hz": wide, "cfg": config}
@@ -68,8 +70,9 @@ class Press:
             world.add_shape_box(press, **plate)
         builder.replicate(world, len(depths))
         model = builder.finalize(device=device)
-        if self.between is not None:
-            model.set_gravity((0.0, 0.0, 0.0))
+        model.set_gravity(
+            (0.0, 0.0, 0.0)
+        )  # the file has the object as it rests, and forces are those beyond its weight
         options = SolverReducedOptions(contact_max=2048)
         solver, states = SolverReduced(model, [body], options=options), (model.state(), model.state())
         poses = states[0].body_q.numpy()
@@ -124,7 +127,7 @@ def _curve(depths: Array, forces: Array, wanted: Array) -> Array:
 def fit_force(
     thing: SoftObject, log: ForceLog, press: Press, *, material: Material, device: wp.DeviceLike = None
 ) -> Fitted:
-    """Fit Young's modulus to forces: the body's forces go with it, so that a few runs find it.
+    """Fit Young's modulus to forces: the body's forces go with it, so that one run finds it.
 
     Args:
         thing: The object, free, with samples as fine as what touches.
@@ -147,28 +150,23 @@ def fit_force(
         raise FitError(what, hint="count the depth from the first touch, and check the size of the object")
     way, force = way[pressed], log.force[pressed]
     depths = way.max() * np.linspace(0.15, 1.0, DEPTHS)
-    modulus, shift = 1.0e5, 0.0
-    for _ in range(3):
-        made = press.forces(thing.body, replace(material, youngs_modulus=modulus), depths, device)
-        if not made.max() > 0.0:
-            raise FitError(f"{log.source}: nothing presses the body there", hint="check the place and the depths")
-        slack = 0.03 * float(way.max())
+    made = press.forces(thing.body, replace(material, youngs_modulus=START), depths, device)
+    if not made.max() > 0.0:
+        raise FitError(f"{log.source}: nothing presses the body there", hint="check the place and the depths")
+    slack = 0.03 * float(way.max())
 
-        def residuals(x: Array, made: Array = made, modulus: float = modulus, slack: float = slack) -> Array:
-            return np.append(
-                (np.exp(x[0]) / modulus * _curve(depths, made, way - x[1]) - force) / (0.03 * force.max()), x[1] / slack
-            )
+    def residuals(x: Array) -> Array:
+        return np.append((np.exp(x[0]) * _curve(depths, made, way - x[1]) - force) / (0.03 * force.max()), x[1] / slack)
 
-        found = least_squares(residuals, [np.log(modulus), shift], x_scale=[0.1, slack])
-        before, modulus, shift = modulus, float(np.exp(found.x[0])), float(found.x[1])
-        if axis is not None or abs(np.log(modulus / before)) < 0.02:  # without weight forces go with E
-            break
+    found = least_squares(residuals, [0.0, 0.0], x_scale=[0.1, slack])
+    factor, shift = float(np.exp(found.x[0])), float(found.x[1])
+    modulus = START * factor
     inverse = np.linalg.inv(found.jac.T @ found.jac)
     spread = float(np.sqrt(inverse[0, 0] * max(2.0 * found.cost / max(len(way) - 2, 1), 0.1)))
     estimate = Estimate.of_logarithm(
         np.log(modulus), float(np.hypot(spread, floor_of(thing) if press.point is None else BALL)), unit="Pa"
     )
-    curve = _curve(depths, made, way - shift) * modulus / before
+    curve = factor * _curve(depths, made, way - shift)
     shallow, deep = (
         modulus * float(force[part].sum() / max(curve[part].sum(), 1e-12))
         for part in ((way > 0.2 * way.max()) & (way < 0.5 * way.max()), way > 0.75 * way.max())
@@ -186,5 +184,5 @@ def fit_force(
         estimates={"youngs_modulus": estimate},
         material=replace(material, youngs_modulus=modulus),
         notes=tuple(notes),
-        details={"depths": depths.tolist(), "forces": (made * modulus / before).tolist(), "touch": shift},
+        details={"depths": depths.tolist(), "forces": (factor * made).tolist(), "touch": shift},
     )
