@@ -28,12 +28,18 @@ from softmode.splats.raster.pinhole import PinholeCamera
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
-SPECIFIC = (8.0, 20.0, 50.0, 120.0, 300.0, 750.0, 1900.0, 4700.0, 12000.0, 30000.0)
+SPECIFIC = np.geomspace(8.0, 3.0e4, 20)
 """Young's modulus over density of the starts [m^2/s^2]."""
+EARLY = 0.4
+"""How much of the motion the starts are compared by [s]: later a stiffness is mistaken for one of another swing."""
+BEYOND = 5.0
+"""How many of its priors a parameter may need."""
 OVERLAP = 0.7
 """Least overlap of object and matte before anything moves, intersection over union."""
 FOLLOWED = 0.6
-"""Least share of the motion's cost that the twin has to explain."""
+"""Least share of the motion's cost that the twin has to explain, where more is left than"""
+LEFT = 0.15
+"""this root mean square of the coverage's residuals."""
 _POSE = NAMES[CAMERA]
 _LASTING = (*_POSE, *NAMES[HOLDER], "edge")
 
@@ -100,7 +106,8 @@ def fit_film(
         what = f"film {clip.name}: only {overlap:.0%} of object and picture overlap before it is let go"
         raise FitError(what, hint="check --size, --up, the object and the camera of the scene, or give --plate")
     residuals.mask(mask)
-    residuals.frames, residuals.moving = every, True
+    early = every[clip.times <= release + EARLY]
+    residuals.frames, residuals.moving = early, True
 
     tell("trying stiffnesses", 0.15)
     sets = np.repeat(np.where(np.arange(15) == 4, space.mean, pose)[None], len(SPECIFIC), axis=0)
@@ -108,7 +115,6 @@ def fit_film(
     costs = kept("costs", lambda: cost_of(residuals(sets)))
     none = sets[:1].copy()
     none[0, 4] = clip.times[-1]
-    unmoved = residuals(none)[0]
     motion = ("youngs_modulus", "viscosity", "start", *_POSE, "edge")
     tight = replace(space, prior=np.where(np.arange(15) == 1, 0.5, space.prior))
 
@@ -121,6 +127,8 @@ def fit_film(
     for n, k in enumerate(np.argsort(costs)[:2]):
         tell("fitting", 0.3 + 0.15 * n)
         found.append(kept(f"start {n}", functools.partial(refined, tight, sets[k], motion)))
+    residuals.frames = every
+    unmoved = residuals(none)[0]
     tell("fitting", 0.6)
     x = min(found, key=lambda one: float(one[0]))[1:]
     x = kept("coverage", functools.partial(refined, space, x, NAMES))[1:]
@@ -129,14 +137,20 @@ def fit_film(
     best = minimise(residuals, space, x, NAMES, rounds=6, lasting=_LASTING)
     cover = best.residuals[: residuals.sizes[0]]
     followed = _followed(cover.reshape(len(every), -1), unmoved)
-    if followed < FOLLOWED:
+    hint = "film one object that is held by one end and let go, before a background at rest"
+    if followed < FOLLOWED and np.sqrt((cover**2).mean()) > LEFT:
         what = f"film {clip.name}: not observable, because the twin follows {followed:.0%} of what moves"
-        raise FitError(what, hint="film one object that is held by one end and let go, before a background at rest")
+        raise FitError(what, hint=hint)
+    needed = np.abs(best.x - space.mean)[2:] / space.prior[2:]
+    if needed.max() > BEYOND:
+        name, beyond = NAMES[2 + int(needed.argmax())], needed.max()
+        what = f"film {clip.name}: not observable, because the twin needs {name} off by {beyond:.0f} times its prior"
+        raise FitError(what, hint=f"check camera, size and --held; {hint}")
     tell("the integrator's share", 0.95)
     shift = integrator_shift(thing, material, best.x, float(clip.times[-1] - best.x[4]), residuals.worlds.dt, device)
     x = best.x.copy()
     x[:2] -= shift
-    told = _told(thing, clip, space, best, x, residuals, mass_known, material)
+    told = _told(thing, clip, space, best, x, residuals, mass_known, material, followed)
     details = {
         "camera": dict(zip(_POSE, best.x[CAMERA].tolist(), strict=True)) | {"nominal": asdict(camera)},
         "start": float(best.x[4]),
@@ -164,10 +178,11 @@ def _told(
     residuals: FilmResiduals,
     mass_known: bool,
     material: Material,
+    followed: float,
 ) -> Fitted:
     """Return what is told of a solution, with bars."""
     deviation = dict(zip(best.free.tolist(), best.deviations(residuals.blocks()), strict=True))
-    bar = float(np.hypot(deviation[0], floor_of(thing)))
+    bar = float(np.hypot(deviation[0] / max(followed, 0.01), floor_of(thing)))
     at_end = min(x[0] - space.low[0], space.high[0] - x[0]) < 0.2
     why = "the film looks the same at every stiffness beyond it" if at_end else ""
     modulus = Estimate.of_logarithm(x[0], bar, unit="Pa", reason=why)
