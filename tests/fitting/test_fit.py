@@ -42,7 +42,10 @@ def bar(functions: int) -> SoftObject:
 
 
 def test_film(tmp_path: Path) -> None:
-    """E is within two bars and 8 % of the truth with all troubles at once, and comes back with the twin's file."""
+    """E is within two bars and 8 % of the truth with all troubles at once, and comes back with the twin's file.
+
+    A fit that was cut off goes on where it was, and ends with the same bits.
+    """
     frames, plate, camera = make_film(bar(36), TRUE, Trouble(), seed=5, seconds=0.6, size=96)
     clip = Clip(frames=frames, times=np.arange(len(frames)) / 30.0)
     thing = bar(24)
@@ -59,6 +62,17 @@ def test_film(tmp_path: Path) -> None:
     again = load(tmp_path / "toy.npz")
     assert again.material is not None and again.material.youngs_modulus == pytest.approx(modulus.value)
     assert json.loads(str(again.body.provenance["fit_bars"]))["youngs_modulus"] == [modulus.low, modulus.high]
+
+    def cut(stage: str, fraction: float) -> None:
+        if stage == "fitting with tracks":
+            raise KeyboardInterrupt
+
+    part = tmp_path / "part.json"
+    with pytest.raises(KeyboardInterrupt):
+        fit_film(thing, clip, camera, HELD, material=unknown, plate=plate, keep=part, progress=cut)
+    gone_on, late, _ = fit_film(thing, clip, camera, HELD, material=unknown, plate=plate, keep=part)
+    assert gone_on.estimates == found.estimates and not part.exists()
+    assert late.worlds.steps < 0.6 * residuals.worlds.steps
     with pytest.raises(FitError, match="overlap"):
         aside = replace(camera, position=(camera.position[0] + 1.0, *camera.position[1:]))
         fit_film(thing, clip, aside, HELD, material=unknown, plate=plate)
