@@ -36,9 +36,9 @@ BEYOND = 5.0
 """How many of its priors a parameter may need."""
 OVERLAP = 0.7
 """Least overlap of object and matte before anything moves, intersection over union."""
-FOLLOWED = 0.6
+FOLLOWED = 0.8
 """Least share of the motion's cost that the twin has to explain, where more is left than"""
-LEFT = 0.15
+LEFT = 0.2
 """this root mean square of the coverage's residuals."""
 _POSE = NAMES[CAMERA]
 _LASTING = (*_POSE, *NAMES[HOLDER], "edge")
