@@ -169,6 +169,23 @@ def fit_film(
     return replace(told, details=details), residuals, best.x
 
 
+def _check_grip(residuals: FilmResiduals, area: NDArray[np.bool_]) -> None:
+    """Refuse a film in which what is held, an area (H, W), moves about as the rest does."""
+    cv2 = open_cv()
+    soft = np.array([cv2.GaussianBlur(c.astype(np.float32), (0, 0), 1.2) for c in residuals.cover])
+    rim = cv2.dilate((np.hypot(*np.gradient(soft[0])) > 0.1).astype(np.uint8), np.ones((3, 3))) > 0
+    moves = []
+    for zone in (rim & area, rim & ~area):
+        if zone.sum() < 20:
+            return
+        change = np.abs(soft[:, zone] - soft[0, zone]).mean(axis=1)
+        flicker = float(np.quantile(np.abs(np.diff(soft[:, zone], axis=0)).mean(axis=1), 0.25))
+        moves.append(float(np.quantile(change, 0.9)) - flicker)
+    if moves[0] > max(0.15, 0.6 * moves[1]):
+        what = f"film {residuals.clip.name}: not observable, because the end that is held moves as the rest does"
+        raise FitError(what, hint="hold one end still, and let the rest go; what is thrown or poked shows no E")
+
+
 def _told(
     thing: SoftObject,
     clip: Clip,
@@ -227,7 +244,9 @@ def _compared(residuals: FilmResiduals, x: Array, cover: Array, held: Held) -> t
     spots = np.zeros(cover.shape, np.uint8)
     shown = ((pixels >= 0) & (pixels < np.array(cover.shape[::-1]))).all(axis=1)
     spots[pixels[shown, 1], pixels[shown, 0]] = 1
-    away = hand | (cv2.dilate(spots, np.ones((5, 5))) > 0)
+    grip_area = cv2.dilate(spots, np.ones((5, 5))) > 0
+    _check_grip(residuals, grip_area)
+    away = hand | grip_area
     both, one = (alpha > 0.5) & (cover > 0.5) & ~away, ((alpha > 0.5) | (cover > 0.5)) & ~away
     return (~away).astype(np.float64), float(both.sum() / max(one.sum(), 1))
 
