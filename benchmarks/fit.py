@@ -79,7 +79,7 @@ def fem_truth(name: str) -> tuple[Any, Any, Material, int]:
     boxes, youngs_modulus, seed = FEM[name]
     shape = Shape(boxes=tuple(Box(lower=b[:3], upper=b[3:]) for b in boxes))
     made = Material(youngs_modulus=youngs_modulus, poissons_ratio=RATIO, density=DENSITY)
-    end = Box(lower=(-INFINITE,) * 3, upper=(0.03, INFINITE, INFINITE))
+    end = Box(lower=(-INFINITE, -INFINITE, -INFINITE), upper=(0.03, INFINITE, INFINITE))
     scene = Scene(
         name=name, shape=shape, energy="stable_neo_hookean_log", youngs_modulus=youngs_modulus, poissons_ratio=RATIO,
         density=DENSITY, clamps=(Clamp(region=end),), gravity=(0.0, 0.0, -9.81), dt=1.0 / 480.0, steps=480,
@@ -88,7 +88,7 @@ def fem_truth(name: str) -> tuple[Any, Any, Material, int]:
     solid, moved = fem.simulate(scene, bdf2=True)
     import trimesh
 
-    mesh = trimesh.Trimesh(*shape.surface()).subdivide_to_size(0.012)
+    mesh: Any = trimesh.Trimesh(*shape.surface()).subdivide_to_size(0.012)
     stripes = (40 + 180 * (np.sin(90 * mesh.vertices[:, :1] + 60 * mesh.vertices[:, 1:2] + [0, 2, 4]) > 0)).astype("u1")
     mesh.visual.vertex_colors = np.hstack([stripes, np.full((len(stripes), 1), 255, np.uint8)])
     size = float(np.ptp(mesh.vertices, axis=0).max())

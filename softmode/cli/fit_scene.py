@@ -107,10 +107,10 @@ class FitScene:
         for name, count in (("position", 3), ("target", 3), ("quat", 4)):
             if name in told:
                 require_numbers(f"camera {name}", told[name], count, hint=hint)
-        size, place = {"width": width, "height": height}, tuple(told["position"])
+        place: Any = tuple(told["position"])
         fov = float(told.get("fov_y", 0.8))
-        target = told.get("target", np.add(place, (0.0, 1.0, 0.0)))
-        camera = PinholeCamera.look_at("film", position=place, target=target, fov_y=fov, **size)
+        target: Any = told.get("target", np.add(place, (0.0, 1.0, 0.0)))
+        camera = PinholeCamera.look_at("film", position=place, target=target, fov_y=fov, width=width, height=height)
         if "quat" in told:
             camera = replace(camera, quat=tuple(told["quat"]))
         if "matrix" in told:

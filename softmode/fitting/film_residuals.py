@@ -124,7 +124,8 @@ class FilmResiduals:
         count, frames = q.shape[:2]
         drawn = self.pictures.draw(q.reshape(-1, *q.shape[2:]), poses.reshape(-1, 4, 4))
         small = self._small(drawn * self._mask).reshape(count, frames, *self._target.shape[1:])
-        slope = np.hypot(*np.gradient(small, axis=(2, 3)))
+        rows, columns = np.gradient(small, axis=(2, 3))
+        slope = np.hypot(rows, columns)
         r = (small + sets[:, 11, None, None, None] * slope - self._target[self.frames])[:, :, self._pixels]
         if self.moving:
             r = r - STATIC_SHARE * r.mean(axis=1, keepdims=True)

@@ -14,6 +14,7 @@ from scipy.optimize import least_squares
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body
+from softmode.deformables.model.tables import present
 from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
 from softmode.errors import ConfigError, FitError
 from softmode.fitting.estimates import Estimate, Fitted, floor_of
@@ -75,7 +76,7 @@ class Press:
         )  # the file has the object as it rests, and forces are those beyond its weight
         options = SolverReducedOptions(contact_max=2048)
         solver, states = SolverReduced(model, [body], options=options), (model.state(), model.state())
-        poses = states[0].body_q.numpy()
+        poses = present(states[0].body_q).numpy()
         poses[:, 3:] = (0.0, 0.0, 0.0, 1.0)
 
         def both() -> None:
@@ -85,7 +86,7 @@ class Press:
         def place(share: float) -> None:
             poses[:, :3] = start + toward * (share * depths)[:, None]
             for state in states:
-                state.body_q.assign(poses)
+                present(state.body_q).assign(poses)
 
         place(0.0)
         graph = capture_graph(both, model.device)

@@ -13,6 +13,7 @@ from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body
 from softmode.deformables.model.namespaces import soft
+from softmode.deformables.model.tables import present
 from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
 from softmode.deformables.tools.start import set_states
 from softmode.errors import SolverDiverged
@@ -62,7 +63,7 @@ class FitWorlds:
         self._graph: Callable[[], None] | None = None
         if load is not None:
             for state in self._states:
-                state.particle_f.assign(np.tile(load, (count, 1)).astype(np.float32))
+                present(state.particle_f).assign(np.tile(load, (count, 1)).astype(np.float32))
 
     def run(
         self,
@@ -95,8 +96,7 @@ class FitWorlds:
         turn = np.broadcast_to(np.atleast_2d(tilt), (worlds, 2))[whole]
         down = np.stack([-np.sin(turn[:, 1]), np.sin(turn[:, 0]) * np.cos(turn[:, 1])], axis=1)
         gravity = GRAVITY * np.column_stack([down, -np.sqrt(1.0 - (down**2).sum(axis=1))])
-        gravity_array: wp.array = self._model.gravity
-        gravity_array[: self.count].assign(gravity.astype(np.float32))
+        present(self._model.gravity)[: self.count].assign(gravity.astype(np.float32))
         if self._graph is None:
             self._graph = capture_graph(self._two_steps, self._model.device).launch
         for state in self._states:
@@ -114,7 +114,7 @@ class FitWorlds:
         self.steps += count * every * worlds
         if not np.isfinite(found).all():
             raise SolverDiverged("a world of the fit is no longer finite", hint="narrow the range of Young's modulus")
-        return np.arange(count + 1) * self.dt * every, found
+        return self.dt * every * np.arange(count + 1, dtype=np.float64), found
 
     def states(self, sets: Array, starts: Array, times: Array) -> Array:
         """Return coordinates at times [s], shape (W, F, n, 3), of any number of sets of parameters.
@@ -125,7 +125,7 @@ class FitWorlds:
             times: Times (F,) [s].
         """
         some, which = np.unique(sets, axis=0, return_inverse=True)
-        seconds, found = max(float(times.max() - starts.min()), 0.0) + 4.0 * self.dt, []
+        seconds, at, found = max(float(times.max() - starts.min()), 0.0) + 4.0 * self.dt, np.zeros(0), []
         for first in range(0, len(some), self.count):
             part = some[first : first + self.count]
             given = {"youngs_modulus": np.exp(part[:, 0]), "viscosity": np.exp(part[:, 1])}

@@ -9,6 +9,7 @@ import functools
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -33,7 +34,7 @@ HELD = Held.parse("-x:0.03")
 @functools.cache
 def bar(functions: int) -> SoftObject:
     """Return a coloured bar of 20 x 5 x 4 cm with its first 3 cm held."""
-    mesh = trimesh.creation.box((0.2, 0.05, 0.04)).subdivide_to_size(0.012)
+    mesh: Any = trimesh.creation.box((0.2, 0.05, 0.04)).subdivide_to_size(0.012)
     stripes = (40 + 180 * (np.sin(90 * mesh.vertices[:, :1] + [0, 2, 4]) > 0)).astype(np.uint8)
     mesh.visual.vertex_colors = np.hstack([stripes, np.full((len(stripes), 1), 255, np.uint8)])
     made = BuildOptions(function_count=functions, kernel_count=300, cubature_count=128)
