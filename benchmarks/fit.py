@@ -107,7 +107,7 @@ def fem_truth(name: str) -> tuple[Any, Any, Material, int]:
 
 
 def run(
-    name: str, *, trouble: Trouble, anew: bool, verbose: bool, device: str | None = None
+    name: str, *, trouble: Trouble, anew: bool, verbose: bool, device: str | None = None, seconds: float = 0.9
 ) -> tuple[float, float, float, float, float]:
     """Return ln E found over true, its bar, the same of viscosity, and the seconds of the fit."""
     held, moved, dt = Held.parse("-x:0.03"), None, 1.0 / 960.0
@@ -132,7 +132,7 @@ def run(
     else:
         thing = held_object(load(preset, splat_count=2500, size=size, pose="captured", material=made), held)
     youngs_modulus, viscosity = made.youngs_modulus, max(made.viscosity, 1e-3)
-    frames, plate, camera = make_film(truth, made, trouble, seed, moved=moved, dt=dt)
+    frames, plate, camera = make_film(truth, made, trouble, seed, moved=moved, dt=dt, seconds=seconds)
     density = DENSITY * truth.body.volume / thing.body.volume  # the mass is weighed
     clip = Clip(frames=frames, times=np.arange(len(frames)) / 30.0, name=name)
     start, wall = time.process_time(), time.perf_counter()
@@ -143,7 +143,7 @@ def run(
 
     material = Material(poissons_ratio=RATIO, density=density)
     found, _, x = fit_film(thing, clip, camera, held, material=material, plate=plate, progress=tell, device=device)
-    seconds = time.process_time() - start
+    taken = time.process_time() - start
     e, v = found["youngs_modulus"], found["viscosity"]
     if verbose:
         print(found.details, np.round(x, 4).tolist())
@@ -154,10 +154,10 @@ def run(
         f"{'' if e.observable else ' (not observable)'}; viscosity {1e3 * viscosity:.1f} ms:"
         f" {more[0]:+.2f} +- {more[1]:.2f}; followed {found.details['followed']:.3f}, {found.details['tracks']} tracks;"
         f" integrator {' '.join(f'{v:.3f}' for v in found.details['integrator'].values())};"
-        f" volume {thing.body.volume / truth.body.volume:.3f}; {seconds:.0f} s",
+        f" volume {thing.body.volume / truth.body.volume:.3f}; {taken:.0f} s",
         flush=True,
     )
-    return (*out, *more, seconds)
+    return (*out, *more, taken)
 
 
 def main() -> None:
@@ -167,15 +167,15 @@ def main() -> None:
     parser.add_argument("--none", action="store_true", help="no trouble")
     parser.add_argument("--same", action="store_true", help="the object of the fit is built from the same mesh")
     parser.add_argument("--device")
+    parser.add_argument("--seconds", type=float, default=0.9, help="of film")
     parser.add_argument("--verbose", action="store_true")
     options = parser.parse_args()
     rows = []
     for name in options.names or (*CASES, *FEM, *WRONG):
         try:
             trouble = NONE if options.none else Trouble()
-            rows.append(
-                run(name, trouble=trouble, anew=not options.same, verbose=options.verbose, device=options.device)
-            )
+            given = {"verbose": options.verbose, "device": options.device, "seconds": options.seconds}
+            rows.append(run(name, trouble=trouble, anew=not options.same, **given))
         except SoftmodeError as error:
             print(f"{name:14s} refused: {error}", file=sys.stderr, flush=True)
     if rows:
