@@ -54,14 +54,14 @@ def test_jaws_against_finite_elements() -> None:
 
 @pytest.mark.rest
 def test_ball_against_hertz() -> None:
-    """A ball on a block presses as Hertz's, F = 4/3 E / (1 - nu^2) sqrt(R) d^(3/2): E within 12 %.
+    """A ball on a block presses as Hertz's, F = 4/3 E / (1 - nu^2) sqrt(R) d^(3/2): E within 10 %.
 
-    A third of the radius deep Hertz's own is off by some per cent, and the dents of the contact by as much.
+    Its radius is five times the distance of the samples. With three times E comes out 15 % too large.
     """
-    thing, radius, way = box(0.1, 0.1, 0.1, samples=4000), 0.012, 0.004 * WAY
+    thing, radius, way = box(0.1, 0.1, 0.1, samples=4000), 0.02, 0.004 * WAY
     force = 4.0 / 3.0 * TRUE.youngs_modulus / (1.0 - TRUE.poissons_ratio**2) * radius**0.5 * way**1.5
     press = Press(point=(0.0, 0.0, 0.1), radius=radius)
     found = fit_force(thing, ForceLog(way=way, force=force, opening=False), press, material=TRUE)
-    assert found["youngs_modulus"].value == pytest.approx(TRUE.youngs_modulus, rel=0.12)
+    assert found["youngs_modulus"].value == pytest.approx(TRUE.youngs_modulus, rel=0.1)
     with pytest.raises(ConfigError, match="from the object"):
         Press(point=(0.0, 0.0, 0.3)).forces(thing.body, TRUE, np.array([0.001]))
