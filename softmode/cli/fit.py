@@ -118,10 +118,9 @@ class Fit:
         forces = table and holds_forces(self.file)
         base = ObjectConfig(surface_count=3000) if forces else ObjectConfig()
         config = self.toy.object_of(base)
-        ratio = scene.poissons_ratio
-        if ratio is None:
-            ratio = 0.35 if config.material is None else config.material.poissons_ratio
-        made = Material(poissons_ratio=ratio)
+        made = config.material or Material(poissons_ratio=0.35)
+        if scene.poissons_ratio is not None:
+            made = dataclasses.replace(made, poissons_ratio=scene.poissons_ratio)
         free = load(config, material=made)
         density, known = scene.density_of(free.body.volume)
         material = dataclasses.replace(made, density=density)

@@ -100,8 +100,8 @@ class Fitted:
             path: The .npz to write.
             thing: The object, free; what was found and from which film goes into its body's provenance.
         """
-        numbers = {name: getattr(self.material, name) for name in ("youngs_modulus", "poissons_ratio", "density")}
-        numbers |= {"viscosity": self.material.viscosity}
+        names = ("youngs_modulus", "poissons_ratio", "density", "viscosity", "friction")
+        numbers = {name: getattr(self.material, name) for name in names}
         bars = {name: [e.low, e.high] for name, e in self.estimates.items() if e.observable}
         told = {
             "material": json.dumps(numbers),
