@@ -53,6 +53,10 @@ class GraspError(SoftmodeError, ValueError):
     """A gripper has no grasp of an object."""
 
 
+class FitError(SoftmodeError, ValueError):
+    """A film, markers or a force log do not show what an object is made of."""
+
+
 class LanesError(SoftmodeError, TypeError):
     """A device function cannot be translated into code for eight points at a time, which CPUs run."""
 

@@ -31,13 +31,14 @@ OPTIONAL = (
         "imageio_ffmpeg",
         "tyro",
     ),
-    *("pxr", "newton_usd_schemas", "rerun", "viser", "matplotlib", "mujoco_menagerie", "backports", "compression"),
+    *("cv2", "pxr", "newton_usd_schemas", "rerun", "viser", "matplotlib", "mujoco_menagerie", "backports", "compression"),
 )
 """Modules that only extras bring; `compression` is where Python 3.14 keeps Zstandard."""
 
 CASES = {
     "command line": ("demo", "import softmode.cli.main; softmode.cli.main.main(['list-envs'])"),
     "film": ("demo", "from softmode.viz.film import Film; Film(Path('lift.mp4'))"),
+    "film to fit": ("fit", "from softmode.fitting.film import open_cv; open_cv()"),
     "tensors": ("rl", "import softmode, gymnasium as g; g.make_vec('softmode/PushSoft-v0', output='torch')"),
     "Stable-Baselines3": ("rl", "from softmode.envs.adapters import StableBaselinesVecEnv"),
     "rsl_rl": ("rsl-rl", "from softmode.envs.adapters import RslRlVecEnv"),

@@ -23,6 +23,7 @@ ROOMS = (
     "radiance",
     "objects",
     "scenes",
+    "fitting",
     "envs",
     "usd",
     "viz",

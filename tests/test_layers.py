@@ -20,7 +20,7 @@ FLOORS = (
     "objects",
     "scenes",
     "envs usd viz",
-    "demonstrations learning",
+    "demonstrations fitting learning",
     "view testing",
     "cli",
     "__main__",

@@ -13,6 +13,7 @@ from softmode import __version__
 from softmode.cli.bench import Bench
 from softmode.cli.body import BodyBuild, BodyCheck, BodyCut, BodyShow
 from softmode.cli.check import Check
+from softmode.cli.fit import Fit
 from softmode.cli.listing import ListEnvs
 from softmode.cli.morph import Morph
 from softmode.cli.new import New
@@ -43,7 +44,7 @@ softmode list-envs lists the tasks, softmode --help the commands, softmode play 
 Commands = dict[str, "type | tuple[str, Commands]"]
 COMMANDS: Commands = {
     **{"play": Play, "train": Train, "evaluate": Evaluate, "export": Export, "bench": Bench, "record": Record},
-    **{"view": View, "morph": Morph, "new": New, "check": Check, "list-envs": ListEnvs, "robots": Robots},
+    **{"view": View, "morph": Morph, "fit": Fit, "new": New, "check": Check, "list-envs": ListEnvs, "robots": Robots},
     "splat": (
         "Draw, make, inspect and convert splat files.",
         {"show": SplatShow, "from-mesh": SplatFromMesh, "info": SplatInfo, "convert": SplatConvert},

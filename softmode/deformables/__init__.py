@@ -69,5 +69,6 @@ if TYPE_CHECKING:
     from softmode.deformables.tools.sensing import ContactSensor as ContactSensor
     from softmode.deformables.tools.sensing import ForceTorqueSensor as ForceTorqueSensor
     from softmode.deformables.tools.sensing import SurfacePressure as SurfacePressure
+    from softmode.deformables.tools.start import set_states as set_states
 
 __getattr__, __dir__ = lazy_names(__name__)

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from softmode.objects.config import ObjectConfig as ObjectConfig
     from softmode.objects.config import StifferBox as StifferBox
     from softmode.objects.cut import cut_object as cut_object
+    from softmode.objects.frame import file_frame as file_frame
     from softmode.objects.loader import build_object as build_object
     from softmode.objects.loader import load as load
     from softmode.objects.mesh_file import read_mesh as read_mesh

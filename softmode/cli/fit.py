@@ -1,0 +1,180 @@
+"""The command ``softmode fit``: what a real object is made of, from a film, markers or forces."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from softmode.cli.common import bar_interval, own_group, quiet_warp, short_name, warp_device
+from softmode.cli.object_options import ObjectOptions
+from softmode.errors import ConfigError
+from softmode.files import check_place
+
+if TYPE_CHECKING:
+    from softmode.cli.fit_scene import FitScene
+    from softmode.fitting.estimates import Fitted
+    from softmode.objects.soft_object import SoftObject
+
+
+def _argument() -> object:
+    """Return what makes a field an argument; evaluated when tyro reads it."""
+    import tyro
+
+    return tyro.conf.Positional
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Fit:
+    """Find what a real object is made of, and write its twin.
+
+    Example: softmode fit film.mp4 --splat toy.ply --size 0.16 --mass 0.142 --held top:0.03 --camera 0 -0.5 0.2
+    """
+
+    file: Annotated[Path, _argument()]
+    """A film of the object, held by one end and let go; or a .csv: time [s] and markers [m], or depth and force with
+    their units."""
+    held: str | None = None
+    """End that is held and how much of it [m], in the file's axes: top:0.03, bottom:0.02, --held=-x:0.01."""
+    mass: float | None = None
+    """Mass of the object [kg]; without it or --density only E over density is known."""
+    poissons_ratio: float | None = None
+    """Poisson's ratio; a preset's own, else 0.35, if omitted."""
+    camera: tuple[float, float, float] | None = None
+    """About where the camera was, in the axes of the object's file [m]; it looks at the object's middle."""
+    fov: float = 0.8
+    """Vertical angle that it sees [rad]."""
+    plate: Path | None = None
+    """Picture of the background without the object; the median of the film if omitted."""
+    fps_true: float | None = None
+    """Frames per second at which a film was taken that plays slower."""
+    scene: Path | None = None
+    """JSON file: kind, held, fps, mass, density, poissons_ratio, camera, markers, axes, load."""
+    press: tuple[float, float, float] | None = None
+    """Of a force log: where a ball presses the object on a table, in the axes of its file [m]."""
+    radius: float = 0.006
+    """Radius of the ball [m]."""
+    between: Literal["x", "y", "z"] | None = None
+    """Of a force log: the axis along which two jaws close on the object."""
+    out: Annotated[Path | None, short_name("-o")] = None
+    """Twin to write, with fit.json and the film of the fit (.mp4) beside it; out/OBJECT.npz if omitted."""
+    device: str | None = None
+    """Warp device, for example cpu or cuda:0."""
+    toy: Annotated[ObjectOptions, own_group()] = dataclasses.field(default_factory=ObjectOptions)
+    """The object: its splats, mesh or preset."""
+
+    @property
+    def twin(self) -> Path:
+        """The file of the twin."""
+        return self.out or Path("out", f"{(self.toy.file or self.file).stem}.npz")
+
+    def run(self) -> int:
+        """Fit, print, write; return the exit code."""
+        toy = self.toy.file
+        if toy is None:
+            raise ConfigError("no object is given", hint="name its splats or mesh, like --splat toy.ply --size 0.16")
+        out = self.twin
+        if out.suffix.lower() != ".npz":
+            raise ConfigError(f"out {out} is no .npz file", hint="name it like out/toy.npz")
+        check_place(out, "twin")
+        if self.toy.density is not None and self.mass is not None:
+            raise ConfigError("--mass and --density are given", hint="give one of them")
+        from softmode.cli.fit_scene import FitScene
+
+        scene = FitScene.read(
+            self.scene,
+            held=self.held,
+            mass=self.mass,
+            density=self.toy.density,
+            poissons_ratio=self.poissons_ratio,
+            fps=self.fps_true,
+        )
+        with quiet_warp():
+            found, free, film = self._fitted(scene)
+            found.write(out.with_name("fit.json"))
+            for line in found.lines():
+                print(line)
+            twin = found.save(out, free)
+            print(f"wrote {out} ({twin.body.function_count} functions) and {out.with_name('fit.json')}")
+            if film is not None:
+                self._film(out.with_suffix(".mp4"), *film)
+        return 0
+
+    def _fitted(self, scene: FitScene) -> tuple[Fitted, SoftObject, Any]:
+        """Return what was found, the object, free, and what the film of the fit shows."""
+        from softmode.deformables.materials.material import Material
+        from softmode.fitting.film import Clip
+        from softmode.fitting.film_fit import fit_film
+        from softmode.fitting.force_fit import Press, fit_force
+        from softmode.fitting.holding import Held, held_object
+        from softmode.fitting.marker_fit import fit_markers
+        from softmode.fitting.tables import holds_forces, read_forces, read_markers
+        from softmode.objects.config import ObjectConfig
+        from softmode.objects.frame import laid_down
+        from softmode.objects.loader import load
+
+        device = warp_device(self.device)
+        table = self.file.suffix.lower() == ".csv"
+        forces = table and holds_forces(self.file)
+        base = ObjectConfig(surface_count=3000) if forces else ObjectConfig()
+        config = self.toy.object_of(base)
+        made = config.material or Material(poissons_ratio=0.35)
+        if scene.poissons_ratio is not None:
+            made = dataclasses.replace(made, poissons_ratio=scene.poissons_ratio)
+        free = load(config, material=made)
+        density, known = scene.density_of(free.body.volume)
+        material = dataclasses.replace(made, density=density)
+        if forces:
+            between = None if self.between is None else "xyz".index(self.between)
+            if (self.press is None) == (between is None):
+                hint = "give --press X Y Z --radius R, or --between y"
+                raise ConfigError("a force log, and not one way in which it was taken", hint=hint)
+            press = Press(point=self.press, radius=self.radius, between=between)
+            return fit_force(free, read_forces(self.file), press, material=material, device=device), free, None
+        if scene.held is None:
+            raise ConfigError("held is not told", hint="say which end is held, like --held top:0.03")
+        held = Held.parse(scene.held)
+        captured = load(config.changed(pose="captured"), material=made) if laid_down(free.body) else free
+        thing = held_object(captured, held)
+        if table:
+            markers, places = read_markers(self.file), scene.places()
+            return fit_markers(thing, markers, places, material=material, device=device), free, None
+        clip = Clip.read(self.file, fps_true=scene.fps)
+        height, width = clip.frames.shape[1:3]
+        if self.camera is not None:
+            middle = (thing.body.bounds + thing.body.offset).mean(axis=0)
+            told = {"position": self.camera, "target": middle.tolist(), "fov_y": self.fov}
+            scene = dataclasses.replace(scene, camera=told)
+        camera = scene.pinhole(width, height, clip.shrink)
+        from tqdm import tqdm
+
+        with tqdm(total=100, desc="fitting", unit="%", mininterval=bar_interval()) as bar:
+
+            def tell(stage: str, fraction: float) -> None:
+                bar.set_postfix_str(stage, refresh=False)
+                bar.update(max(round(100.0 * fraction) - bar.n, 0))
+
+            found, residuals, x = fit_film(
+                thing,
+                clip,
+                camera,
+                held,
+                material=material,
+                plate=None if self.plate is None else clip.like(self.plate),
+                mass_known=known,
+                keep=self.twin.with_suffix(".fit.part.json"),
+                device=device,
+                progress=tell,
+            )
+        return found, free, (residuals, x)
+
+    def _film(self, path: Path, residuals: Any, x: Any) -> None:
+        """Write the film beside the twin."""
+        from softmode.fitting.comparison import side_by_side
+        from softmode.viz.film import Film
+
+        with Film(path) as film:
+            for picture in side_by_side(residuals, x):
+                film.add(picture, max(round(1.0 / residuals.clip.interval), 1))
+            film.publish()
+        print(f"wrote {path}: the film, the twin, and where they differ")

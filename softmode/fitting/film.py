@@ -1,0 +1,221 @@
+"""`Clip`: a film as arrays with the times of its frames, and what covers its background."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softmode.checks import require_number
+from softmode.errors import AssetError, FitError, needs_extra
+from softmode.objects.fingerprint import file_fingerprint
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+LEAST_FRAMES = 8
+LONGEST = 20.0
+"""Longest film that is read [s]."""
+EDGE = 192
+"""Longest edge to which frames are made smaller [px]."""
+
+
+def open_cv() -> Any:
+    """Return OpenCV.
+
+    Raises:
+        MissingExtraError: If it is not installed.
+    """
+    with needs_extra("fit", "a film is read with OpenCV"):
+        import cv2
+    return cv2
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Clip:
+    """A film of one fixed camera."""
+
+    frames: Image
+    """RGB, shape (F, H, W, 3)."""
+    times: Array
+    """Of the frames, from the first [s], shape (F,)."""
+    name: str = "film"
+    """What messages call it."""
+    fingerprint: str = ""
+    """sha256 of its file."""
+    shrink: float = 1.0
+    """Its pixels over those of the file, along an edge."""
+
+    def __post_init__(self) -> None:
+        """Refuse what is no film."""
+        if len(self.frames) < LEAST_FRAMES or not self.times[-1] > 0.2:
+            what = f"film {self.name}: {len(self.frames)} frames of {self.times[-1] if len(self.times) else 0.0:.2f} s"
+            raise FitError(what, hint="film a second or more from before the object is let go")
+        if not (np.diff(self.times) > 0.0).all():
+            raise FitError(f"film {self.name}: its times do not increase", hint="export it again at a constant rate")
+
+    @property
+    def interval(self) -> float:
+        """Usual time between two frames [s]."""
+        return float(np.median(np.diff(self.times)))
+
+    def like(self, path: Path) -> Image:
+        """Return a picture of the same camera, of the film's size.
+
+        Raises:
+            AssetError: If it cannot be read.
+        """
+        cv2 = open_cv()
+        found = cv2.imread(str(path), cv2.IMREAD_COLOR)
+        if found is None:
+            raise AssetError(f"plate {path}: cannot be read", hint="give a .png or .jpg of the background")
+        size = self.frames.shape[2], self.frames.shape[1]
+        return cv2.resize(found[..., ::-1], size, interpolation=cv2.INTER_AREA)
+
+    @classmethod
+    def read(cls, path: Path, *, fps_true: float | None = None) -> Clip:
+        """Read a film: times and rotation as the file has them, frames at most `EDGE` wide and high.
+
+        Args:
+            path: A film, or an animated GIF.
+            fps_true: Frames per second at which a film was taken that plays slower or faster.
+
+        Raises:
+            AssetError: If it is missing or cannot be read.
+            FitError: If it is too short.
+        """
+        cv2 = open_cv()
+        if not path.is_file():
+            raise AssetError(f"film {path}: no such file", hint="check the path")
+        found = list(_gif(path) if path.suffix.lower() == ".gif" else _video(path))
+        if not found:
+            raise AssetError(f"film {path}: no frame can be read", hint="export it as .mp4 (H.264)")
+        times = np.array([time for time, _ in found])
+        times = times - times[0]
+        if fps_true is not None:
+            require_number("fps_true", fps_true, above=0.0, at_most=1.0e5, hint="give frames per second, like 240")
+            times = times / (np.median(np.diff(times)) if len(times) > 1 else 1.0) / fps_true
+        height, width = found[0][1].shape[:2]
+        shrink = min(1.0, EDGE / max(height, width))
+        size = (round(shrink * width), round(shrink * height))
+        frames = [cv2.resize(f, size, interpolation=cv2.INTER_AREA) if shrink < 1.0 else f for _, f in found]
+        return cls(
+            frames=np.array(frames),
+            times=times,
+            name=str(path),
+            fingerprint=file_fingerprint(path),
+            shrink=size[0] / width,
+        )
+
+
+def _video(path: Path) -> Any:
+    """Yield times [s] and frames (RGB) of a film."""
+    cv2 = open_cv()
+    reader = cv2.VideoCapture(str(path))  # turns frames by the file's own flag, and gives 8 bits
+    while True:
+        good, frame = reader.read()
+        time = 1.0e-3 * reader.get(cv2.CAP_PROP_POS_MSEC)
+        if not good or time > LONGEST:
+            reader.release()
+            return
+        yield time, frame[..., ::-1]
+
+
+def _gif(path: Path) -> Any:
+    """Yield times [s] and frames (RGB) of an animated GIF."""
+    from PIL import Image as Picture
+    from PIL import ImageSequence
+
+    time = 0.0
+    with Picture.open(path) as file:
+        for frame in ImageSequence.Iterator(file):
+            yield time, np.asarray(frame.convert("RGB"))
+            time += 1.0e-3 * max(float(frame.info.get("duration", 100.0)), 10.0)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Mattes:
+    """What covers the background of a film."""
+
+    cover: Array
+    """0..1, shape (F, H, W)."""
+    noise: float
+    """Standard deviation of the film's noise, of 255."""
+    release: int
+    """The last frame before anything moves."""
+
+
+def find_mattes(clip: Clip, plate: Image | None) -> Mattes:
+    """Find what covers the background, when it begins to move, and what speaks against a fit.
+
+    Args:
+        clip: The film.
+        plate: The picture without the object, (H, W, 3); None takes the median of the film, which shows the object
+            where it never leaves.
+
+    Raises:
+        FitError: If the camera moves, the film is cut, nothing is there or moves, or it leaves the picture.
+    """
+    cv2 = open_cv()
+    smooth = np.array([cv2.GaussianBlur(f.astype(np.float32), (0, 0), 0.6) for f in clip.frames])
+    steps = np.diff(clip.frames.astype(np.float32), axis=0)
+    noise = max(float(1.4826 / np.sqrt(2.0) * np.median(np.abs(steps[steps != 0.0]))) if steps.any() else 0.0, 1.0)
+    back = np.median(smooth, axis=0) if plate is None else plate.astype(np.float32)
+    if back.shape != smooth.shape[1:]:
+        raise FitError(
+            f"plate has shape {back.shape}, the film {smooth.shape[1:]}", hint="take it with the same camera"
+        )
+    _check_background(clip, smooth, noise)
+    level = np.clip((smooth * back).sum(axis=3) / ((back * back).sum(axis=2) + 1e-6), 0.98, 1.02)
+    away = np.sqrt(((smooth - level[..., None] * back) ** 2).mean(axis=3))
+    cover = np.array([_solid(np.clip((a - 3.0 * noise) / (7.0 * noise), 0.0, 1.0)) for a in away])
+    if (cover > 0.5).mean(axis=(1, 2)).max() < 0.002 or (cover > 0.5).mean() > 0.7:
+        hint = "film it before another background, or give the picture without it: --plate empty.png"
+        raise FitError(f"film {clip.name}: the object cannot be told from the background", hint=hint)
+    release = _release(clip, cover)
+    edge = np.ones(cover.shape[1:], bool)
+    edge[2:-2, 2:-2] = False
+    if (cover[release:, edge] > 0.5).sum(axis=1).max() > (cover[0, edge] > 0.5).sum() + 6:
+        raise FitError(f"film {clip.name}: the object leaves the picture", hint="film it from farther away")
+    return Mattes(cover=cover, noise=noise, release=release)
+
+
+def _solid(cover: Array) -> Array:
+    """Return a matte without specks and small holes."""
+    cv2 = open_cv()
+    hard = (cover > 0.5).astype(np.uint8)
+    count, label, stats, _ = cv2.connectedComponentsWithStats(hard)
+    keep = np.isin(label, [i for i in range(1, count) if stats[i, 4] >= 25]).astype(np.uint8)
+    closed = cv2.morphologyEx(hard, cv2.MORPH_CLOSE, np.ones((5, 5)))
+    return np.maximum(cover, closed) * cv2.dilate(keep, np.ones((3, 3)))
+
+
+def _check_background(clip: Clip, smooth: Array, noise: float) -> None:
+    """Refuse a film whose background changes; the object covers less than half of it."""
+    steps = np.median(np.abs(np.diff(smooth, axis=0)), axis=(1, 2, 3))
+    limit = 2.0 * float(np.quantile(steps, 0.25)) + 0.5 * noise
+    cuts = np.flatnonzero(steps > limit)
+    if 0 < len(cuts) <= 2:
+        what = f"film {clip.name}: is cut at {clip.times[cuts[0] + 1]:.2f} s"
+        raise FitError(what, hint="give one take, from before it is let go")
+    if len(cuts) or np.median(np.abs(smooth[-1] - smooth[0])) > limit:
+        raise FitError(f"film {clip.name}: the camera or the light moves", hint="put the camera on a tripod")
+
+
+def _release(clip: Clip, cover: Array) -> int:
+    """Return the last frame before anything moves; refuse a film in which nothing does."""
+    cv2 = open_cv()
+    soft = np.array([cv2.GaussianBlur(c.astype(np.float32), (0, 0), 1.2) for c in cover])
+    still = np.abs(np.diff(soft, axis=0)).reshape(len(soft) - 1, -1)
+    flicker = float(np.median(np.sort(still.sum(axis=1))[: max(3, len(still) // 4)]))
+    change = np.abs(soft - soft[0]).reshape(len(soft), -1).sum(axis=1)
+    rim = np.sqrt(max(float((cover[0] > 0.5).sum()), 1.0))
+    if change.max() < 1.3 * flicker + 0.1 * rim:
+        hint = (
+            "let go of one end, hold it so that it sags, or film a softer object; a stiff one needs --press and a scale"
+        )
+        raise FitError(f"film {clip.name}: not observable, because nothing moves by more than a pixel", hint=hint)
+    moved = np.flatnonzero(change > 1.3 * flicker + 0.08 * (change.max() - 1.3 * flicker))
+    return max(int(moved[0]) - 1, 0)

@@ -1,0 +1,301 @@
+"""`fit_film`: what an object is made of that is held by one end and let go, from a film of one fixed camera."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from softmode.deformables.materials.material import Material
+from softmode.errors import FitError
+from softmode.fitting.estimates import Estimate, Fitted, floor_of
+from softmode.fitting.film import Clip, Image, find_mattes, open_cv
+from softmode.fitting.film_residuals import CAMERA, HOLDER, NAMES, FilmResiduals, film_space
+from softmode.fitting.holding import Held
+from softmode.fitting.kept import KeptStages
+from softmode.fitting.least_squares import Solution, Space, cost_of, minimise
+from softmode.fitting.pictures import project
+from softmode.fitting.tracks import follow
+from softmode.fitting.worlds import FitWorlds
+from softmode.objects.soft_object import SoftObject
+from softmode.splats.raster.pinhole import PinholeCamera
+
+Array = NDArray[np.float64]
+Progress = Callable[[str, float], None]
+SPECIFIC = np.geomspace(8.0, 3.0e4, 20)
+"""Young's modulus over density of the starts [m^2/s^2]."""
+EARLY = 0.4
+"""How much of the motion the starts are compared by [s]: later a stiffness is mistaken for one of another swing."""
+BEYOND = 5.0
+"""How many of its priors a parameter may need."""
+OVERLAP = 0.7
+"""Least overlap of object and matte before anything moves, intersection over union."""
+FOLLOWED = 0.8
+"""Least share of the motion's cost that the twin has to explain, where more is left than"""
+LEFT = 0.2
+"""this root mean square of the coverage's residuals."""
+_POSE = NAMES[CAMERA]
+_LASTING = (*_POSE, *NAMES[HOLDER], "edge")
+
+
+def fit_film(
+    thing: SoftObject,
+    clip: Clip,
+    camera: PinholeCamera,
+    held: Held,
+    *,
+    material: Material,
+    plate: Image | None = None,
+    mass_known: bool = True,
+    keep: Path | None = None,
+    device: wp.DeviceLike = None,
+    progress: Progress | None = None,
+) -> tuple[Fitted, FilmResiduals, Array]:
+    """Fit Young's modulus and viscosity, with gravity, start, camera, matte and holder free about what is told.
+
+    Args:
+        thing: The object with its end held, see `held_object`.
+        clip: The film.
+        camera: About where the camera is, in the axes of the object's file, for frames of the film's size.
+        held: What is held.
+        material: Density and Poisson's ratio; the rest is where the fit begins.
+        plate: The picture without the object, of the film's size.
+        mass_known: Whether the density is measured; else only E over density is told.
+        keep: File that keeps the stages that are done until all are; a fit that was cut off goes on with them.
+        device: Warp device.
+        progress: Told each stage and how far it is, 0..1.
+
+    Returns:
+        What was found; what it was fitted with; and all parameters, as `film_residuals.NAMES` has them.
+
+    Raises:
+        FitError: If the film does not show it: nothing moves, the object is another one, the motion is not followed.
+    """
+    done: tuple[str, float] = ("", 0.0)
+
+    def tell(stage: str, fraction: float) -> None:
+        nonlocal done
+        done = (stage, fraction)
+        if progress is not None:
+            progress(stage, fraction)
+
+    pixels = hashlib.sha256(clip.frames.tobytes() + clip.times.tobytes() + (b"" if plate is None else plate.tobytes()))
+    kept = KeptStages(keep, pixels.hexdigest(), thing.body.fingerprint, camera, held, material)
+    tell("looking at the film", 0.0)
+    mattes = find_mattes(clip, plate)
+    tracks = follow(clip, mattes.cover)
+    placed = replace(camera, position=tuple(np.subtract(camera.position, thing.body.offset).tolist()))
+    residuals = FilmResiduals(thing, material, clip, mattes, placed, device=device)
+    residuals.after = lambda: tell(done[0], min(done[1] + 0.01, 0.99))
+    every, release = residuals.frames, float(clip.times[mattes.release])
+    space = film_space(release - 0.25 * clip.interval, clip.interval, material.density)
+
+    tell("finding the camera", 0.05)
+    still = np.unique(np.linspace(0, mattes.release, 3).astype(int))
+    residuals.frames = still
+    posed = replace(space, mean=np.where(np.arange(15) == 4, clip.times[-1], space.mean), high=np.full(15, np.inf))
+    pose = kept("pose", lambda: minimise(residuals, posed, posed.mean, (*_POSE, "edge"), rounds=6).x)
+    mask, overlap = _compared(residuals, pose, mattes.cover[0], held)
+    if overlap < OVERLAP:
+        what = f"film {clip.name}: only {overlap:.0%} of object and picture overlap before it is let go"
+        raise FitError(what, hint="check --size, --up, the object and the camera of the scene, or give --plate")
+    residuals.mask(mask)
+    early = every[clip.times <= release + EARLY]
+    residuals.frames, residuals.moving = early, True
+
+    tell("trying stiffnesses", 0.15)
+    sets = np.repeat(np.where(np.arange(15) == 4, space.mean, pose)[None], len(SPECIFIC), axis=0)
+    sets[:, 0] = np.log(np.array(SPECIFIC) * material.density)
+    costs = kept("costs", lambda: cost_of(residuals(sets)))
+    none = sets[:1].copy()
+    none[0, 4] = clip.times[-1]
+    motion = ("youngs_modulus", "viscosity", "start", *_POSE, "edge")
+    tight = replace(space, prior=np.where(np.arange(15) == 1, 0.5, space.prior))
+
+    def refined(space: Space, start: Array, names: Sequence[str]) -> Array:
+        """Return the cost and the parameters near a start."""
+        one = minimise(residuals, space, start, names, rounds=4, lasting=_LASTING)
+        return np.append(one.cost, one.x)
+
+    found: list[Array] = []
+    for n, k in enumerate(np.argsort(costs)[:2]):
+        tell("fitting", 0.3 + 0.15 * n)
+        found.append(kept(f"start {n}", functools.partial(refined, tight, sets[k], motion)))
+    residuals.frames = every
+    unmoved = residuals(none)[0]
+    tell("fitting", 0.6)
+    x = min(found, key=lambda one: float(one[0]))[1:]
+    x = kept("coverage", functools.partial(refined, space, x, NAMES))[1:]
+    tell("fitting with tracks", 0.8)
+    residuals.anchor(tracks, x)
+    best = minimise(residuals, space, x, NAMES, rounds=6, lasting=_LASTING)
+    cover = best.residuals[: residuals.sizes[0]]
+    followed = _followed(cover.reshape(len(every), -1), unmoved)
+    hint = "film one object that is held by one end and let go, before a background at rest"
+    if followed < FOLLOWED and np.sqrt((cover**2).mean()) > LEFT:
+        what = f"film {clip.name}: not observable, because the twin follows {followed:.0%} of what moves"
+        raise FitError(what, hint=hint)
+    needed = np.abs(best.x - space.mean)[2:] / space.prior[2:]
+    if needed.max() > BEYOND:
+        name, beyond = NAMES[2 + int(needed.argmax())], needed.max()
+        what = f"film {clip.name}: not observable, because the twin needs {name} off by {beyond:.0f} times its prior"
+        raise FitError(what, hint=f"check camera, size and --held; {hint}")
+    tell("the integrator's share", 0.95)
+    shift = integrator_shift(thing, material, best.x, float(clip.times[-1] - best.x[4]), residuals.worlds.dt, device)
+    x = best.x.copy()
+    x[:2] -= shift
+    told = _told(thing, clip, space, best, x, residuals, mass_known, material, followed)
+    details = {
+        "camera": dict(zip(_POSE, best.x[CAMERA].tolist(), strict=True)) | {"nominal": asdict(camera)},
+        "start": float(best.x[4]),
+        "followed": followed,
+        "tracks": len(residuals.tracks),
+        "starts": [{"youngs_modulus": float(np.exp(one[1])), "cost": float(one[0])} for one in found],
+        "costs": {"at_rest": float(cost_of(unmoved[None])[0]), "tried": np.round(costs, 3).tolist(), "end": best.cost},
+        "overlap": overlap,
+        "residual_of_frames": np.round(np.sqrt((cover.reshape(len(every), -1) ** 2).mean(axis=1)), 4).tolist(),
+        "integrator": {"youngs_modulus": float(np.exp(shift[0])), "viscosity": float(np.exp(shift[1]))},
+        "world_steps": residuals.worlds.steps,
+        "pictures": residuals.pictures.drawn,
+    }
+    kept.done()
+    tell("done", 1.0)
+    return replace(told, details=details), residuals, best.x
+
+
+def _check_grip(residuals: FilmResiduals, area: NDArray[np.bool_]) -> None:
+    """Refuse a film in which what is held, an area (H, W), moves about as the rest does."""
+    cv2 = open_cv()
+    soft = np.array([cv2.GaussianBlur(c.astype(np.float32), (0, 0), 1.2) for c in residuals.cover])
+    rim = cv2.dilate((np.hypot(*np.gradient(soft[0])) > 0.1).astype(np.uint8), np.ones((3, 3))) > 0
+    moves = []
+    for zone in (rim & area, rim & ~area):
+        if zone.sum() < 20:
+            return
+        change = np.abs(soft[:, zone] - soft[0, zone]).mean(axis=1)
+        flicker = float(np.quantile(np.abs(np.diff(soft[:, zone], axis=0)).mean(axis=1), 0.25))
+        moves.append(float(np.quantile(change, 0.9)) - flicker)
+    if moves[0] > max(0.15, 0.6 * moves[1]):
+        what = f"film {residuals.clip.name}: not observable, because the end that is held moves as the rest does"
+        raise FitError(what, hint="hold one end still, and let the rest go; what is thrown or poked shows no E")
+
+
+def _told(
+    thing: SoftObject,
+    clip: Clip,
+    space: Space,
+    best: Solution,
+    x: Array,
+    residuals: FilmResiduals,
+    mass_known: bool,
+    material: Material,
+    followed: float,
+) -> Fitted:
+    """Return what is told of a solution, with bars."""
+    deviation = dict(zip(best.free.tolist(), best.deviations(residuals.blocks()), strict=True))
+    bar = float(np.hypot(deviation[0] / max(followed, 0.01), floor_of(thing)))
+    at_end = min(x[0] - space.low[0], space.high[0] - x[0]) < 0.2
+    why = "the film looks the same at every stiffness beyond it" if at_end else ""
+    modulus = Estimate.of_logarithm(x[0], bar, unit="Pa", reason=why)
+    swings = "its motion dies, or is too small, before a second swing is seen" if deviation[1] > 0.5 else ""
+    viscosity = Estimate.of_logarithm(x[1], float(np.hypot(deviation[1], 0.1)), unit="s", reason=swings)
+    notes = [f"from {len(clip.times)} frames and {len(residuals.tracks)} tracks"]
+    frequency = first_frequency(thing, float(np.exp(x[0])), material)
+    if frequency > 0.5 / clip.interval:
+        notes.append(
+            f"the object swings at {frequency:.3g} Hz, beyond half of the film's {1.0 / clip.interval:.3g} frames per"
+            " second: film faster, or give --fps-true if it was"
+        )
+    changes = {"youngs_modulus": modulus.value} if modulus.observable else {}
+    if viscosity.observable:
+        changes["viscosity"] = viscosity.value
+    estimates = {"youngs_modulus": modulus, "viscosity": viscosity}
+    if not mass_known:
+        over = {name: getattr(modulus, name) / material.density for name in ("value", "low", "high")}
+        ratio = replace(modulus, unit="m^2/s^2", **over)
+        estimates = {"youngs_modulus_over_density": ratio, **estimates}
+        notes.append(f"E is for {material.density:g} kg/m^3, which was not measured: give --mass for E")
+    return Fitted(
+        source=clip.name,
+        fingerprint=clip.fingerprint,
+        estimates=estimates,
+        material=replace(material, **changes),
+        notes=tuple(notes),
+    )
+
+
+def _compared(residuals: FilmResiduals, x: Array, cover: Array, held: Held) -> tuple[Array, float]:
+    """Return where the film is compared (H, W): not on the holder; and how far object and matte overlap."""
+    cv2 = open_cv()
+    q, poses = residuals.states(x[None])[0, :1], residuals.poses(x[None])[0, :1]
+    alpha = residuals.pictures.draw(q, poses)[0]
+    near = cv2.dilate((alpha > 0.1).astype(np.uint8), np.ones((9, 9)))
+    hand = cv2.dilate(((cover > 0.5) & (near == 0)).astype(np.uint8), np.ones((7, 7))) > 0
+    means = residuals.thing.visible_splats.means
+    inside = residuals.thing.body.regions.envelope(1.0)
+    grip = inside.holds(means) if inside is not None else np.zeros(len(means), bool)
+    pixels = np.round(project(residuals.camera, poses[0], means[grip])[0] - 0.5).astype(int)
+    spots = np.zeros(cover.shape, np.uint8)
+    shown = ((pixels >= 0) & (pixels < np.array(cover.shape[::-1]))).all(axis=1)
+    spots[pixels[shown, 1], pixels[shown, 0]] = 1
+    grip_area = cv2.dilate(spots, np.ones((5, 5))) > 0
+    _check_grip(residuals, grip_area)
+    away = hand | grip_area
+    both, one = (alpha > 0.5) & (cover > 0.5) & ~away, ((alpha > 0.5) | (cover > 0.5)) & ~away
+    return (~away).astype(np.float64), float(both.sum() / max(one.sum(), 1))
+
+
+def _followed(r: Array, unmoved: Array) -> float:
+    """Return how much of what moves the twin follows, 0..1.
+
+    What is left holds noise, which is new in each frame, and what is not followed, which is not: the correlation
+    between frames tells them apart.
+
+    Args:
+        r: Residuals of the coverage that are left, by frames (F, M).
+        unmoved: Those of a twin that stays at rest (F M,).
+    """
+    before, after = cost_of(np.stack([unmoved, r.ravel()]))
+    r = r - r.mean(axis=0)
+    alike = max(abs(float((r[k:] * r[:-k]).sum())) for k in (1, 2)) / max(float((r * r).sum()), 1e-12)
+    signal = max(float(before - after), 0.0)
+    return signal / max(signal + alike * float(after), 1e-12)
+
+
+def first_frequency(thing: SoftObject, youngs_modulus: float, material: Material) -> float:
+    """Return about the lowest frequency of an object that one end holds [Hz]: that of a cantilever of its size."""
+    low, high = thing.body.bounds
+    span = np.sort(high - low)
+    return 0.1615 * float(span[0]) / float(span[2]) ** 2 * float(np.sqrt(youngs_modulus / material.density))
+
+
+def integrator_shift(
+    thing: SoftObject, material: Material, x: Array, seconds: float, dt: float, device: wp.DeviceLike
+) -> Array:
+    """Return by how much ln E and ln viscosity come out too large because of the steps, (2,).
+
+    With steps of a quarter the body moves as it does with these steps and a little more of both; by how much is found
+    from their derivatives, along the motion of the surface.
+    """
+    rows = thing.body.surface.basis[:: max(1, thing.body.surface_count // 60)]
+
+    times = np.arange(0.0, seconds, 4.0 * dt)
+
+    def motion(sets: Array, step: float) -> Array:
+        worlds = FitWorlds(thing.body, material, len(sets), dt=step, device=device)
+        q = worlds.states(sets, np.zeros(len(sets)), times)
+        return np.einsum("sk,wtkc->wtsc", rows, q).reshape(len(sets), -1)
+
+    sets = np.repeat(x[None, :4], 3, axis=0)
+    steps = np.array([0.02, 0.1])
+    sets[1, 0] += steps[0]
+    sets[2, 1] += steps[1]
+    coarse, fine = motion(sets, dt), motion(sets[:1], dt / 4.0)
+    slopes = (coarse[1:] - coarse[0]) / steps[:, None]
+    return np.linalg.lstsq(slopes.T, fine[0] - coarse[0], rcond=None)[0]

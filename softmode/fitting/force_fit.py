@@ -1,0 +1,189 @@
+"""`fit_force`: Young's modulus from forces over a way, of a ball that presses an object or of two jaws."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import newton
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
+from scipy.optimize import least_squares
+
+from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.materials.material import Material
+from softmode.deformables.model.authoring import add_reduced_body
+from softmode.deformables.model.tables import present
+from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
+from softmode.errors import ConfigError, FitError
+from softmode.fitting.estimates import Estimate, Fitted, floor_of
+from softmode.fitting.tables import ForceLog
+from softmode.objects.frame import file_frame
+from softmode.objects.soft_object import SoftObject
+from softmode.scenes.capture import capture_graph
+
+Array = NDArray[np.float64]
+START = 1.0e5
+"""Young's modulus of the run [Pa]: without weight, forces go with it."""
+DEPTHS = 8
+"""Depths that are simulated, a world each."""
+STEP, RAMP, REST = 0.01, 40, 40
+"""Step [s], steps while it presses, and steps until it lies still."""
+BALL = 0.12
+"""Standard deviation of ln E that the contact of a ball leaves: against Hertz's law."""
+FOAM = 0.15
+"""Relative change of E over the depth from which on one E does not fit."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Press:
+    """A ball that presses an object on a table, or two jaws with the object between them."""
+
+    point: tuple[float, float, float] | None = None
+    """Where the ball presses, in the axes of the object's file [m]."""
+    radius: float = 0.006
+    """Of the ball [m]."""
+    between: int | None = None
+    """Axis along which jaws close, 0 to 2."""
+
+    def forces(self, body: ReducedBody, material: Material, depths: Array, device: wp.DeviceLike = None) -> Array:
+        """Return the forces at depths [m], each in a world of its own [N], shape (D,).
+
+        Raises:
+            ConfigError: If the point is not near the object.
+        """
+        low, high = body.surface.points.min(axis=0), body.surface.points.max(axis=0)
+        wide = 2.0 * float((high - low).max())
+        world, builder = newton.ModelBuilder(), newton.ModelBuilder()
+        add_reduced_body(world, body, material=replace(material, mass_damping=20.0))
+        press = world.add_body(is_kinematic=True, xform=wp.transform((0.0, 0.0, 10.0 * wide), wp.quat_identity()))
+        config = newton.ModelBuilder.ShapeConfig(mu=1.0)
+        plate = {"hx": wide, "hy": wide, "hz": wide, "cfg": config}
+        axis = np.eye(3)[2 if self.between is None else self.between]
+        behind = 0.5 * (low + high) - axis * (0.5 * float((high - low) @ axis) + wide)
+        world.add_shape_box(-1, xform=wp.transform(tuple(behind), wp.quat_identity()), **plate)
+        if self.between is None:
+            start, toward = self._contact(body)
+            world.add_shape_sphere(press, radius=self.radius, cfg=config)
+        else:
+            start, toward = low + high - behind, -axis
+            world.add_shape_box(press, **plate)
+        builder.replicate(world, len(depths))
+        model = builder.finalize(device=device)
+        model.set_gravity(
+            (0.0, 0.0, 0.0)
+        )  # the file has the object as it rests, and forces are those beyond its weight
+        options = SolverReducedOptions(contact_max=2048)
+        solver, states = SolverReduced(model, [body], options=options), (model.state(), model.state())
+        poses = present(states[0].body_q).numpy()
+        poses[:, 3:] = (0.0, 0.0, 0.0, 1.0)
+
+        def both() -> None:
+            solver.step(states[0], states[1], None, None, STEP)
+            solver.step(states[1], states[0], None, None, STEP)
+
+        def place(share: float) -> None:
+            poses[:, :3] = start + toward * (share * depths)[:, None]
+            for state in states:
+                present(state.body_q).assign(poses)
+
+        place(0.0)
+        graph = capture_graph(both, model.device)
+        for state in states:
+            solver.reset(state)
+        for k in range((RAMP + REST) // 2):
+            place(min(1.0, (2 * k + 2) / RAMP))
+            graph.launch()
+        wrench = solver.body_wrench.numpy().reshape(len(depths), -1)[:, :3]
+        return -(wrench @ toward)
+
+    def _contact(self, body: ReducedBody) -> tuple[Array, Array]:
+        """Return where the ball's centre is when it touches, and which way it goes, in the body frame."""
+        frame = file_frame(body)
+        point = frame[:3, :3] @ np.asarray(self.point, float) + frame[:3, 3]
+        off = np.linalg.norm(body.surface.points - point, axis=1)
+        nearest = int(off.argmin())
+        size = float(np.ptp(body.bounds, axis=0).max())
+        if off[nearest] > 0.15 * size:
+            hint = "give a place on the surface, in metres, as softmode splat show draws them"
+            raise ConfigError(f"press: {self.point} lies {off[nearest]:.3g} m from the object", hint=hint)
+        near = off < max(self.radius, 1.5 * off[nearest])
+        normal = body.surface.normals[near].mean(axis=0)
+        normal /= np.linalg.norm(normal)
+        # the ball touches where the first sample does
+        away = body.surface.points[near] - point
+        along = away @ normal
+        aside = np.linalg.norm(away - along[:, None] * normal, axis=1)
+        reach = along + np.sqrt(np.maximum(self.radius**2 - np.minimum(aside, self.radius) ** 2, 0.0))
+        return point + normal * float(reach.max()), -normal
+
+
+def _curve(depths: Array, forces: Array, wanted: Array) -> Array:
+    """Return forces at wanted depths, by monotone cubics through none and those at some depths."""
+    curve = PchipInterpolator(np.append(0.0, depths), np.append(0.0, forces))
+    return curve(np.clip(wanted, 0.0, depths[-1]))
+
+
+def fit_force(
+    thing: SoftObject, log: ForceLog, press: Press, *, material: Material, device: wp.DeviceLike = None
+) -> Fitted:
+    """Fit Young's modulus to forces: the body's forces go with it, so that one run finds it.
+
+    Args:
+        thing: The object, free, with samples as fine as what touches.
+        log: The forces.
+        press: What presses.
+        material: Poisson's ratio and density; the rest is where the fit begins.
+        device: Warp device.
+
+    Raises:
+        FitError: If no depth is pressed at which the body resists.
+    """
+    axis = press.between
+    extent = float(np.ptp(thing.body.surface.points, axis=0)[axis]) if axis is not None else 0.0
+    if log.opening and axis is None:
+        raise ConfigError("the log has openings, and nothing is between jaws", hint="give --between x, y or z")
+    way = extent - log.way if log.opening else log.way
+    pressed = (way > 0.0) & (log.force > 0.0)
+    if pressed.sum() < 4:
+        what = f"{log.source}: {int(pressed.sum())} forces at depths > 0"
+        raise FitError(what, hint="count the depth from the first touch, and check the size of the object")
+    way, force = way[pressed], log.force[pressed]
+    depths = way.max() * np.linspace(0.15, 1.0, DEPTHS)
+    made = press.forces(thing.body, replace(material, youngs_modulus=START), depths, device)
+    if not made.max() > 0.0:
+        raise FitError(f"{log.source}: nothing presses the body there", hint="check the place and the depths")
+    slack = 0.03 * float(way.max())
+
+    def residuals(x: Array) -> Array:
+        return np.append((np.exp(x[0]) * _curve(depths, made, way - x[1]) - force) / (0.03 * force.max()), x[1] / slack)
+
+    found = least_squares(residuals, [0.0, 0.0], x_scale=[0.1, slack])
+    factor, shift = float(np.exp(found.x[0])), float(found.x[1])
+    modulus = START * factor
+    inverse = np.linalg.inv(found.jac.T @ found.jac)
+    spread = float(np.sqrt(inverse[0, 0] * max(2.0 * found.cost / max(len(way) - 2, 1), 0.1)))
+    estimate = Estimate.of_logarithm(
+        np.log(modulus), float(np.hypot(spread, floor_of(thing) if press.point is None else BALL)), unit="Pa"
+    )
+    curve = factor * _curve(depths, made, way - shift)
+    shallow, deep = (
+        modulus * float(force[part].sum() / max(curve[part].sum(), 1e-12))
+        for part in ((way > 0.2 * way.max()) & (way < 0.5 * way.max()), way > 0.75 * way.max())
+    )
+    notes = [f"from {len(way)} forces up to {1e3 * way.max():.3g} mm"]
+    if abs(np.log(max(deep, 1.0) / max(shallow, 1.0))) > FOAM and shallow > 0.0:
+        law = "a foam that yields" if deep < shallow else "a foam that has closed"
+        notes.append(
+            f"no single E fits: {shallow / 1e3:.3g} kPa when it is pressed a little, {deep / 1e3:.3g} kPa at the end,"
+            f" as {law} does"
+        )
+    return Fitted(
+        source=log.source,
+        fingerprint=log.fingerprint,
+        estimates={"youngs_modulus": estimate},
+        material=replace(material, youngs_modulus=modulus),
+        notes=tuple(notes),
+        details={"depths": depths.tolist(), "forces": (factor * made).tolist(), "touch": shift},
+    )

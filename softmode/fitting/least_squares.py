@@ -1,0 +1,164 @@
+"""Least squares by SciPy over residuals that are evaluated in batches: a place and its Jacobian at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+Array = NDArray[np.float64]
+Residuals = Callable[[Array], Array]
+"""From parameters (W, p) to residuals in units of their noise (W, M)."""
+KEPT = 3
+"""Jacobians for which lasting derivatives are kept."""
+HUBER = 2.5
+"""Residuals beyond this count by their size and not by its square."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Space:
+    """The parameters of a fit."""
+
+    names: tuple[str, ...]
+    """Their names (p)."""
+    mean: Array
+    """What is expected of each, (p,)."""
+    prior: Array
+    """Standard deviation of what is expected, infinite where nothing is, (p,)."""
+    step: Array
+    """Steps of the differences that make a Jacobian, (p,)."""
+    low: Array
+    """Least values (p,)."""
+    high: Array
+    """Largest values (p,)."""
+
+    def index(self, *names: str) -> NDArray[np.intp]:
+        """Return where parameters are."""
+        return np.array([self.names.index(name) for name in names])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Solution:
+    """Where least squares ended."""
+
+    x: Array
+    """Parameters (p,)."""
+    free: NDArray[np.intp]
+    """Which of them were free (k)."""
+    cost: float
+    """Half the sum of what the residuals and the priors cost."""
+    residuals: Array
+    """Residuals (M,), without the priors."""
+    jacobian: Array
+    """Their derivatives by the free parameters (M, k)."""
+    prior: Array
+    """Standard deviations of the priors of the free parameters (k,)."""
+    evaluations: int
+    """Jacobians that were evaluated."""
+
+    def deviations(self, blocks: Sequence[NDArray[np.intp]]) -> Array:
+        """Return standard deviations of the free parameters, (k,).
+
+        Of two the larger: that of Gauss and Newton with the priors, times chi where it is above one, and that of the
+        sandwich over blocks of residuals which may err together (White 1980, doi:10.2307/1912934).
+
+        Args:
+            blocks: Indices of residuals.
+        """
+        r, J = self.residuals, self.jacobian
+        w = np.where(np.abs(r) < HUBER, 1.0, HUBER / np.maximum(np.abs(r), 1e-12))
+        inverse = np.linalg.inv(J.T @ (w[:, None] * J) + np.diag(1.0 / self.prior**2))
+        moved = np.abs(J).sum(axis=1)
+        active = moved > 1e-3 * moved.max()
+        chi = float((w * r * r)[active].sum() / max(int(active.sum()) - len(self.free), 1))
+        scores = np.array([J[b].T @ (w * r)[b] for b in blocks])
+        sandwich = inverse @ (scores.T @ scores + np.diag(1.0 / self.prior**2)) @ inverse
+        return np.sqrt(np.maximum(np.diag(inverse) * max(chi, 1.0), np.diag(sandwich)))
+
+
+def minimise(
+    residuals: Residuals,
+    space: Space,
+    start: Array,
+    free: Sequence[str],
+    *,
+    rounds: int,
+    lasting: Sequence[str] = (),
+    tolerance: float = 1.0e-3,
+) -> Solution:
+    """Find the parameters of least residuals near a start.
+
+    Args:
+        residuals: Gives the residuals of a batch of parameters.
+        space: The parameters.
+        start: Where to begin (p,).
+        free: Which of them may change.
+        rounds: Jacobians at most.
+        lasting: Those whose derivatives hardly change: they are kept for `KEPT` Jacobians.
+        tolerance: Relative change of the cost, and of the parameters in their priors, at which it ends.
+    """
+    which = space.index(*free)
+    prior, mean = space.prior[which], space.mean[which]
+    known: dict[bytes, tuple[Array, Array]] = {}
+
+    def batch(y: Array) -> tuple[Array, Array]:
+        """Return residuals and Jacobian, priors included."""
+        key = y.tobytes()
+        if key not in known:
+            renewed = np.ones(len(which), bool) if len(counted) % KEPT == 0 else ~lasts
+            rows = np.flatnonzero(renewed)
+            sets = np.repeat(start[None], len(rows) + 1, axis=0)
+            sets[:, which] = y
+            steps = np.where(y + space.step[which] > space.high[which], -1.0, 1.0) * space.step[which]
+            sets[np.arange(len(rows)) + 1, which[rows]] += steps[rows]
+            found = residuals(sets)
+            slopes = ((found[1:] - found[0]) / steps[rows, None]).T
+            if not renewed.all():
+                fresh, slopes = slopes, latest[0].copy()
+                slopes[:, rows] = fresh
+            latest[:] = [slopes]
+            known.clear()
+            known[key] = (
+                np.append(found[0], (y - mean) / prior),
+                np.vstack([slopes, np.diag(1.0 / prior)]),
+            )
+            counted.append(1)
+        return known[key]
+
+    counted: list[int] = []
+    latest: list[Array] = []
+    lasts = np.isin(np.array(free), lasting)
+    found = least_squares(
+        lambda y: batch(y)[0],
+        np.clip(start[which], space.low[which] + 1e-9, space.high[which] - 1e-9),
+        jac=lambda y: batch(y)[1],  # type: ignore[arg-type]
+        bounds=(space.low[which], space.high[which]),
+        loss="huber",
+        f_scale=HUBER,
+        x_scale=np.where(np.isfinite(prior), prior, 1.0),
+        ftol=tolerance,
+        xtol=tolerance,
+        max_nfev=rounds,
+    )
+    r, J = batch(found.x)
+    x = start.copy()
+    x[which] = found.x
+    m = len(r) - len(which)
+    return Solution(
+        x=x,
+        free=which,
+        cost=float(found.cost),
+        residuals=r[:m],
+        jacobian=J[:m],
+        prior=prior,
+        evaluations=len(counted),
+    )
+
+
+def cost_of(residuals: Array) -> Array:
+    """Return what residuals (W, M) cost, (W,)."""
+    a = np.abs(residuals)
+    return 0.5 * np.where(a < HUBER, a * a, 2.0 * HUBER * a - HUBER**2).sum(axis=1)
