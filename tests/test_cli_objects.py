@@ -192,6 +192,7 @@ EVERYWHERE = (-np.inf,) * 3 + (np.inf,) * 3
 CHOSEN: dict[str, tuple[Any, dict[str, Any]]] = {
     "splat": (Path("toy.ply"), {"splat": Path("toy.ply")}),
     "object": (Path("sponge"), {}),
+    "march": (False, {}),  # splats have no field
     "size": (0.07, {"size": 0.07}),
     "up": ("+z", {"up": "+z"}),
     "crop": ((0.0, -1.0, 0.0, 1.0, 2.0, 3.0), {"crop": (0.0, -1.0, 0.0, 1.0, 2.0, 3.0)}),
@@ -237,9 +238,10 @@ def test_every_command_takes_the_same_options(tmp_path: Path, monkeypatch: pytes
     assert [field.name for field in dataclasses.fields(ObjectOptions)] == [*CHOSEN]
     toy, words = ObjectOptions(**{name: value for name, (value, _) in CHOSEN.items()}), []
     for name, (value, _) in CHOSEN.items():
-        words += [f"--{name.replace('_', '-')}", *map(str, value if isinstance(value, tuple) else (value,))]
+        words += ["--no-march"] if value is False else [f"--{name.replace('_', '-')}"]
+        words += [] if value is False else map(str, value if isinstance(value, tuple) else (value,))
     taking = set()
-    for line in (*commands(tmp_path).values(), ["check", ID], ["body", "cut"]):
+    for line in (*commands(tmp_path).values(), ["check", ID], ["body", "cut"], ["fit", "film.mp4"]):
         command = parsed([*line, *words], monkeypatch)
         assert command.toy == toy
         taking.add(type(command))
@@ -261,6 +263,8 @@ def test_every_option_reaches_the_object() -> None:
     assert preset == ObjectConfig(surface_count=base.surface_count, build=base.build, preset="sponge", size=0.1)
     assert ObjectOptions(size=0.1).object_of(base) == dataclasses.replace(base, size=0.1)
     assert ObjectOptions().object_of(base) == base
+    field = ObjectConfig(radiance="toy.nvdb")
+    assert ObjectOptions(march=True).object_of(field) == dataclasses.replace(field, march=True)
 
 
 @pytest.mark.parametrize(

@@ -77,6 +77,9 @@ class Fit:
         if out.suffix.lower() != ".npz":
             raise ConfigError(f"out {out} is no .npz file", hint="name it like out/toy.npz")
         check_place(out, "twin")
+        for name in ("youngs_modulus", "friction"):
+            if getattr(self.toy, name) is not None:
+                raise ConfigError(f"--{name.replace('_', '-')} says nothing about a fit", hint="leave it out")
         if self.toy.density is not None and self.mass is not None:
             raise ConfigError("--mass and --density are given", hint="give one of them")
         from softmode.cli.fit_scene import FitScene

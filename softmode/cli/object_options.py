@@ -28,7 +28,7 @@ class ObjectOptions:
     """File of any kind: a mesh, a body of `softmode body build`, splats, a radiance field, an OpenUSD stage; or a
     preset's name, see `softmode objects list`."""
     march: bool = False
-    """March rays through the radiance field of the object in every picture, instead of drawing splats baked of it."""
+    """Draw a radiance field ray by ray, not baked."""
     size: float | None = None
     """Longest edge [m]; 0.08 if a file is given, a preset has its own."""
     up: Literal["+x", "-x", "+y", "-y", "+z", "-z"] | None = None
