@@ -428,6 +428,7 @@ COMMANDS = (
     "evaluate",
     "export",
     "bench",
+    "fit",
     "record",
     "view",
     "morph",
@@ -450,7 +451,7 @@ COMMANDS = (
     "objects show",
     "objects export",
 )
-SCREEN = 50
+SCREEN = 53
 """Lines of 80 columns of a screen."""
 
 

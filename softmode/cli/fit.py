@@ -28,7 +28,7 @@ def _argument() -> object:
 class Fit:
     """Find what a real object is made of, and write its twin.
 
-    Example: softmode fit film.mp4 --splat toy.ply --size 0.16 --mass 0.142 --held top:0.03 --camera 0 -0.5 0.2
+    Example: softmode fit press.csv --object sponge --between y
     """
 
     file: Annotated[Path, _argument()]
