@@ -418,9 +418,10 @@ def test_shapes_of_other_worlds_are_not_touched():
 
 
 def test_overflow_is_reported():
-    """More contacts than contact_max raise the overflow bit; the touching ones come first and still hold the cube."""
+    """Too small a contact_max is told with the number; contacts beyond it raise a bit, the touching ones come first."""
     options = SolverReducedOptions(contact_max=8)
-    scene = on_shape(lambda w: w.add_ground_plane(), height=-0.001, options=options)
+    with pytest.warns(RuntimeWarning, match=r"contact_max is 8, and \d+ samples of a body may touch"):
+        scene = on_shape(lambda w: w.add_ground_plane(), height=-0.001, options=options)
     scene.step()
     assert scene.reduced.status.numpy()[0] & bits.WORLD_CONTACT_OVERFLOW
     assert scene.reduced.view.constraints.count.numpy()[0] == 8

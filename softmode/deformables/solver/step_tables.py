@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -244,7 +245,15 @@ def allocate_tables(
         ConfigError: If a body of the model is not among ``bodies``, or a shape cannot be touched.
     """
     device = model.device
-    room = options.contact_room(max((sample_room(body, options.contact_margin) for body in bodies), default=0))
+    wanted = max((sample_room(body, options.contact_margin) for body in bodies), default=0)
+    room = options.contact_room(wanted)
+    if room < wanted and model.shape_count:
+        warnings.warn(
+            f"contact_max is {room}, and {wanted} samples of a body may touch something at a time: what is beyond is left"
+            " out, and flagged as contact_overflow",
+            RuntimeWarning,
+            stacklevel=3,
+        )
     layout = lay_out(model, bodies, pair_max=room // 2 if options.soft_contact else 0)
     row_max = room + layout.pin_max if model.shape_count else 0
     instances, basis = lay_out_instances(model, layout), lay_out_bases(model, layout, row_max)
