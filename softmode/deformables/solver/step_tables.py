@@ -249,8 +249,8 @@ def allocate_tables(
     room = options.contact_room(wanted)
     if room < wanted and model.shape_count:
         warnings.warn(
-            f"contact_max is {room}, and {wanted} samples of a body may touch something at a time: what is beyond is left"
-            " out, and flagged as contact_overflow",
+            f"contact_max is {room}, and {wanted} samples of a body may touch something at a time: what is beyond is"
+            " left out, and flagged as contact_overflow",
             RuntimeWarning,
             stacklevel=3,
         )
