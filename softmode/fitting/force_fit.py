@@ -11,12 +11,19 @@ from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 from scipy.optimize import least_squares
 
+from softmode.checks import require_number, require_numbers
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body
+from softmode.deformables.model.status import (
+    WORLD_COLLAPSED,
+    WORLD_CONTACT_OVERFLOW,
+    WORLD_NOT_FINITE,
+    status_reasons,
+)
 from softmode.deformables.model.tables import present
-from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
-from softmode.errors import ConfigError, FitError
+from softmode.deformables.solver.solver_reduced import SolverReduced
+from softmode.errors import ConfigError, FitError, SolverDiverged
 from softmode.fitting.estimates import Estimate, Fitted, floor_of
 from softmode.fitting.tables import ForceLog
 from softmode.objects.frame import file_frame
@@ -32,6 +39,8 @@ STEP, RAMP, REST = 0.01, 40, 40
 """Step [s], steps while it presses, and steps until it lies still."""
 BALL = 0.12
 """Standard deviation of ln E that the contact of a ball leaves: against Hertz's law."""
+FAILED = WORLD_CONTACT_OVERFLOW | WORLD_NOT_FINITE | WORLD_COLLAPSED
+"""Status of a world whose force is none."""
 FOAM = 0.15
 """Relative change of E over the depth from which on one E does not fit."""
 
@@ -47,11 +56,21 @@ class Press:
     between: int | None = None
     """Axis along which jaws close, 0 to 2."""
 
+    def __post_init__(self) -> None:
+        """Refuse what is neither a ball nor two jaws."""
+        if (self.point is None) == (self.between not in (0, 1, 2)):
+            hint = "give --press X Y Z --radius R, or --between y"
+            raise ConfigError("a force log, and not one way in which it was taken", hint=hint)
+        if self.point is not None:
+            require_numbers("press", self.point, 3)
+        require_number("radius", self.radius, above=0.0, unit="m", hint="give it like 0.006")
+
     def forces(self, body: ReducedBody, material: Material, depths: Array, device: wp.DeviceLike = None) -> Array:
         """Return the forces at depths [m], each in a world of its own [N], shape (D,).
 
         Raises:
             ConfigError: If the point is not near the object.
+            SolverDiverged: If a depth is more than the body can be pressed.
         """
         low, high = body.surface.points.min(axis=0), body.surface.points.max(axis=0)
         wide = 2.0 * float((high - low).max())
@@ -71,11 +90,9 @@ class Press:
             world.add_shape_box(press, **plate)
         builder.replicate(world, len(depths))
         model = builder.finalize(device=device)
-        model.set_gravity(
-            (0.0, 0.0, 0.0)
-        )  # the file has the object as it rests, and forces are those beyond its weight
-        options = SolverReducedOptions(contact_max=2048)
-        solver, states = SolverReduced(model, [body], options=options), (model.state(), model.state())
+        # the file has the object as it rests, and forces are those beyond its weight
+        model.set_gravity((0.0, 0.0, 0.0))
+        solver, states = SolverReduced(model, [body]), (model.state(), model.state())
         poses = present(states[0].body_q).numpy()
         poses[:, 3:] = (0.0, 0.0, 0.0, 1.0)
 
@@ -95,6 +112,10 @@ class Press:
         for k in range((RAMP + REST) // 2):
             place(min(1.0, (2 * k + 2) / RAMP))
             graph.launch()
+        for depth, bits in zip(depths, solver.status.numpy(), strict=True):
+            if bits & FAILED:
+                what = f"{1e3 * depth:.3g} mm deep: {', '.join(status_reasons(int(bits)))}"
+                raise SolverDiverged(what, hint="check the units of the depths, the place and the size of the object")
         wrench = solver.body_wrench.numpy().reshape(len(depths), -1)[:, :3]
         return -(wrench @ toward)
 
@@ -138,7 +159,9 @@ def fit_force(
         device: Warp device.
 
     Raises:
+        ConfigError: If the log has openings and a ball presses, or the ball is not near the object.
         FitError: If no depth is pressed at which the body resists.
+        SolverDiverged: If a depth is more than the body can be pressed.
     """
     axis = press.between
     extent = float(np.ptp(thing.body.surface.points, axis=0)[axis]) if axis is not None else 0.0
@@ -183,7 +206,7 @@ def fit_force(
         source=log.source,
         fingerprint=log.fingerprint,
         estimates={"youngs_modulus": estimate},
-        material=replace(material, youngs_modulus=modulus),
+        material=replace(material, youngs_modulus=modulus) if estimate.observable else material,
         notes=tuple(notes),
         details={"depths": depths.tolist(), "forces": (factor * made).tolist(), "touch": shift},
     )
