@@ -47,7 +47,7 @@ class Fit:
     mass: float | None = None
     """Mass of the object [kg]; without it or --density only E over density is known."""
     poissons_ratio: float | None = None
-    """Poisson's ratio; a preset's own, else 0.35, if omitted."""
+    """Poisson's ratio; that of the preset or body, else 0.35, if omitted."""
     camera: tuple[float, float, float] | None = None
     """About where the camera was, in the axes of the object's file [m]; it looks at the object's middle."""
     fov: float | None = None
@@ -138,7 +138,8 @@ class Fit:
                 _refuse(self, ("fov",), "a film without --camera")
         base = ObjectConfig(surface_count=3000) if forces else ObjectConfig()
         config = self.toy.object_of(base)
-        made = config.material or Material(poissons_ratio=0.35)
+        told = config.material if config.body is None else load(config).material
+        made = told or Material(poissons_ratio=0.35)
         if scene.poissons_ratio is not None:
             made = dataclasses.replace(made, poissons_ratio=scene.poissons_ratio)
         free = load(config, material=made)
@@ -161,8 +162,8 @@ class Fit:
         height, width = clip.frames.shape[1:3]
         if self.camera is not None:
             middle = (thing.body.bounds + thing.body.offset).mean(axis=0)
-            told = {"position": self.camera, "target": middle.tolist(), "fov_y": 0.8 if self.fov is None else self.fov}
-            scene = dataclasses.replace(scene, camera=told)
+            view = {"position": self.camera, "target": middle.tolist(), "fov_y": 0.8 if self.fov is None else self.fov}
+            scene = dataclasses.replace(scene, camera=view)
         camera = scene.pinhole(width, height, clip.shrink)
         from tqdm import tqdm
 

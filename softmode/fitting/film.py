@@ -185,6 +185,12 @@ def find_mattes(clip: Clip, plate: Image | None) -> Mattes:
     return Mattes(cover=cover, noise=noise, release=release)
 
 
+def blurred(pictures: Array) -> NDArray[np.float32]:
+    """Return pictures (F, H, W) blurred by 1.2 px."""
+    cv2 = open_cv()
+    return np.array([cv2.GaussianBlur(p.astype(np.float32), (0, 0), 1.2) for p in pictures])
+
+
 def _solid(cover: Array) -> Array:
     """Return a matte without specks and small holes."""
     cv2 = open_cv()
@@ -209,8 +215,7 @@ def _check_background(clip: Clip, smooth: Array, noise: float) -> None:
 
 def _release(clip: Clip, cover: Array) -> int:
     """Return the last frame before anything moves; refuse a film in which nothing does."""
-    cv2 = open_cv()
-    soft = np.array([cv2.GaussianBlur(c.astype(np.float32), (0, 0), 1.2) for c in cover])
+    soft = blurred(cover)
     still = np.abs(np.diff(soft, axis=0)).reshape(len(soft) - 1, -1)
     flicker = float(np.median(np.sort(still.sum(axis=1))[: max(3, len(still) // 4)]))
     change = np.abs(soft - soft[0]).reshape(len(soft), -1).sum(axis=1)

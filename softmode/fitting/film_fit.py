@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from softmode.deformables.materials.material import Material
 from softmode.errors import FitError
 from softmode.fitting.estimates import Estimate, Fitted, floor_of
-from softmode.fitting.film import Clip, Image, find_mattes, open_cv
+from softmode.fitting.film import Clip, Image, blurred, find_mattes, open_cv
 from softmode.fitting.film_residuals import CAMERA, HOLDER, NAMES, FilmResiduals, film_space
 from softmode.fitting.holding import Held
 from softmode.fitting.kept import KeptStages
@@ -110,7 +110,7 @@ def fit_film(
 
     tell("trying stiffnesses", 0.15)
     sets = np.repeat(np.where(np.arange(15) == 4, space.mean, pose)[None], len(SPECIFIC), axis=0)
-    sets[:, 0] = np.log(np.array(SPECIFIC) * material.density)
+    sets[:, 0] = np.log(SPECIFIC * material.density)
     costs = kept("costs", lambda: cost_of(residuals(sets)))
     none = sets[:1].copy()
     none[0, 4] = clip.times[-1]
@@ -160,8 +160,6 @@ def fit_film(
         "overlap": overlap,
         "residual_of_frames": np.round(np.sqrt((cover.reshape(len(every), -1) ** 2).mean(axis=1)), 4).tolist(),
         "integrator": {"youngs_modulus": float(np.exp(shift[0])), "viscosity": float(np.exp(shift[1]))},
-        "world_steps": residuals.worlds.steps,
-        "pictures": residuals.pictures.drawn,
     }
     kept.done()
     tell("done", 1.0)
@@ -171,7 +169,7 @@ def fit_film(
 def _check_grip(residuals: FilmResiduals, area: NDArray[np.bool_]) -> None:
     """Refuse a film in which what is held, an area (H, W), moves about as the rest does."""
     cv2 = open_cv()
-    soft = np.array([cv2.GaussianBlur(c.astype(np.float32), (0, 0), 1.2) for c in residuals.cover])
+    soft = blurred(residuals.cover)
     rim = cv2.dilate((np.hypot(*np.gradient(soft[0])) > 0.1).astype(np.uint8), np.ones((3, 3))) > 0
     moves = []
     for zone in (rim & area, rim & ~area):

@@ -26,7 +26,7 @@ from softmode.deformables.solver.solver_reduced import SolverReduced
 from softmode.errors import ConfigError, FitError, SolverDiverged
 from softmode.fitting.estimates import Estimate, Fitted, floor_of
 from softmode.fitting.tables import ForceLog
-from softmode.objects.frame import file_frame
+from softmode.objects.frame import in_body
 from softmode.objects.soft_object import SoftObject
 from softmode.scenes.capture import capture_graph
 
@@ -121,8 +121,7 @@ class Press:
 
     def _contact(self, body: ReducedBody) -> tuple[Array, Array]:
         """Return where the ball's centre is when it touches, and which way it goes, in the body frame."""
-        frame = file_frame(body)
-        point = frame[:3, :3] @ np.asarray(self.point, float) + frame[:3, 3]
+        point = in_body(body, self.point)
         off = np.linalg.norm(body.surface.points - point, axis=1)
         nearest = int(off.argmin())
         size = float(np.ptp(body.bounds, axis=0).max())

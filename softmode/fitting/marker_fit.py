@@ -16,7 +16,7 @@ from softmode.fitting.film_fit import SPECIFIC
 from softmode.fitting.least_squares import Space, cost_of, minimise
 from softmode.fitting.tables import Markers
 from softmode.fitting.worlds import FitWorlds
-from softmode.objects.frame import file_frame
+from softmode.objects.frame import in_body
 from softmode.objects.soft_object import SoftObject
 
 Array = NDArray[np.float64]
@@ -90,7 +90,7 @@ class MarkerFit:
             raise ConfigError("markers: none has a place", hint=hint)
         self.thing, self.places, self.material, self._dt, self._device = thing, places, material, dt, device
         body = thing.body
-        rest = self._in_body(np.array(list(places.points.values()), float))
+        rest = in_body(body, list(places.points.values()))
         off = np.linalg.norm(rest[:, None] - body.surface.points, axis=2).min(axis=1)
         size = float(np.ptp(body.bounds, axis=0).max())
         if off.max() > 0.1 * size:
@@ -101,15 +101,10 @@ class MarkerFit:
         if any(places.load):
             if places.load_at is None:
                 raise ConfigError("load hangs nowhere", hint='say where: "load": {"force": [...], "at": [x, y, z]}')
-            at = self._in_body(np.array([places.load_at]))[0]
+            at = in_body(body, places.load_at)
             near = np.argsort(np.linalg.norm(body.surface.points - at, axis=1))[:LOADED]
             self._load = np.zeros((body.surface_count, 3))
             self._load[near] = np.array(places.load) / len(near)
-
-    def _in_body(self, points: Array) -> Array:
-        """Return places of the file (N, 3) in the body frame."""
-        frame = file_frame(self.thing.body)
-        return points @ frame[:3, :3].T + frame[:3, 3]
 
     def moved(self, markers: Markers) -> Array:
         """Return how far the markers are from where they were before the release [m], (F, M, 3), in the object's axes.
@@ -165,7 +160,7 @@ class MarkerFit:
             return ((np.einsum("mk,wtkc->wtmc", self._basis, q) - moved[frames]) / noise).reshape(len(sets), -1)
 
         starts = np.repeat(space.mean[None], len(SPECIFIC), axis=0)
-        starts[:, 0] = np.log(np.array(SPECIFIC) * self.material.density)
+        starts[:, 0] = np.log(SPECIFIC * self.material.density)
         costs = cost_of(residuals(starts))
         best = min(
             (minimise(residuals, space, starts[k], NAMES, rounds=12) for k in np.argsort(costs)[:2]),
