@@ -159,7 +159,7 @@ def fit_force(
 
     Raises:
         ConfigError: If the log has openings and a ball presses, or the ball is not near the object.
-        FitError: If no depth is pressed at which the body resists.
+        FitError: If no depth is pressed at which the body resists, or one between jaws is all of the object.
         SolverDiverged: If a depth is more than the body can be pressed.
     """
     axis = press.between
@@ -172,6 +172,9 @@ def fit_force(
         what = f"{log.source}: {int(pressed.sum())} forces at depths > 0"
         raise FitError(what, hint="count the depth from the first touch, and check the size of the object")
     way, force = way[pressed], log.force[pressed]
+    if axis is not None and way.max() >= extent:
+        what = f"{log.source}: {1e3 * way.max():.3g} mm of an object that is {1e3 * extent:.3g} mm thick there"
+        raise FitError(what, hint="check the unit of the way and the size of the object")
     depths = way.max() * np.linspace(0.15, 1.0, DEPTHS)
     made = press.forces(thing.body, replace(material, youngs_modulus=START), depths, device)
     if not made.max() > 0.0:
