@@ -128,8 +128,6 @@ class Fit:
         film = ("camera", "fov", "plate", "fps_true")
         if forces:
             _refuse(self, ("held", *film), "a force log")
-            between = None if self.between is None else "xyz".index(self.between)
-            press = Press(point=self.press, radius=self.radius, between=between)
         elif table:
             _refuse(self, ("press", "between", *film), "markers")
         else:
@@ -146,6 +144,8 @@ class Fit:
         density, known = scene.density_of(free.body.volume, made.density)
         material = dataclasses.replace(made, density=density)
         if forces:
+            between = None if self.between is None else "xyz".index(self.between)
+            press = Press(point=self.press, radius=self.radius, between=between)
             found = fit_force(free, read_forces(self.file), press, material=material, device=device)
             note = f"the twin has {density:g} kg/m^3, which was not measured: give --mass"
             return found if known else dataclasses.replace(found, notes=(*found.notes, note)), free, None

@@ -96,7 +96,7 @@ class FilmResiduals:
         self._pixels = near & (self._small(mask[None])[0] > 0.99)
 
     @staticmethod
-    def _small(pictures: Array) -> Array:
+    def _small(pictures: Array) -> NDArray[np.float32]:
         """Return pictures blurred, every second pixel."""
         return blurred(pictures)[:, ::2, ::2]
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import newton
 import numpy as np
 import warp as wp
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import PchipInterpolator
 from scipy.optimize import least_squares
 
@@ -82,8 +82,8 @@ class Press:
         axis = np.eye(3)[2 if self.between is None else self.between]
         behind = 0.5 * (low + high) - axis * (0.5 * float((high - low) @ axis) + wide)
         world.add_shape_box(-1, xform=wp.transform(tuple(behind), wp.quat_identity()), **plate)
-        if self.between is None:
-            start, toward = self._contact(body)
+        if self.point is not None:
+            start, toward = self._contact(body, self.point)
             world.add_shape_sphere(press, radius=self.radius, cfg=config)
         else:
             start, toward = low + high - behind, -axis
@@ -119,9 +119,9 @@ class Press:
         wrench = solver.body_wrench.numpy().reshape(len(depths), -1)[:, :3]
         return -(wrench @ toward)
 
-    def _contact(self, body: ReducedBody) -> tuple[Array, Array]:
-        """Return where the ball's centre is when it touches, and which way it goes, in the body frame."""
-        point = in_body(body, self.point)
+    def _contact(self, body: ReducedBody, place: ArrayLike) -> tuple[Array, Array]:
+        """Return where the ball's centre is when it touches a place of the file, and its way, in the body frame."""
+        point = in_body(body, place)
         off = np.linalg.norm(body.surface.points - point, axis=1)
         nearest = int(off.argmin())
         size = float(np.ptp(body.bounds, axis=0).max())
