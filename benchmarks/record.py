@@ -10,14 +10,14 @@ from __future__ import annotations
 import argparse
 import datetime
 import json
-import platform
-import re
 import shlex
 import subprocess
 import sys
 from pathlib import Path
 
 import warp as wp
+
+from softmode.cluster.ray_tasks import processor
 
 DATA = Path(__file__).resolve().parents[1] / "docs" / "data"
 
@@ -61,9 +61,7 @@ def machine(device: str) -> str:
     found = wp.get_device(device)
     if found.is_cuda:
         return f"one {found.name}"
-    information = Path("/proc/cpuinfo")
-    names = re.findall(r"model name\s*: (.+)", information.read_text()) if information.exists() else []
-    return f"one core, {names[0] if names else platform.processor() or platform.machine()}"
+    return f"one core, {processor()}"
 
 
 def commit() -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -15,6 +16,13 @@ if TYPE_CHECKING:
     from softmode.cli.fit_scene import FitScene
     from softmode.fitting.estimates import Fitted
     from softmode.objects.soft_object import SoftObject
+
+
+def _refuse(options: object, names: Sequence[str], what: str) -> None:
+    """Refuse options that are given and say nothing about what is fitted to."""
+    for name in names:
+        if getattr(options, name) is not None:
+            raise ConfigError(f"--{name.replace('_', '-')} says nothing about {what}", hint="leave it out")
 
 
 def _argument() -> object:
@@ -39,11 +47,11 @@ class Fit:
     mass: float | None = None
     """Mass of the object [kg]; without it or --density only E over density is known."""
     poissons_ratio: float | None = None
-    """Poisson's ratio; a preset's own, else 0.35, if omitted."""
+    """Poisson's ratio; that of the preset or body, else 0.35, if omitted."""
     camera: tuple[float, float, float] | None = None
     """About where the camera was, in the axes of the object's file [m]; it looks at the object's middle."""
-    fov: float = 0.8
-    """Vertical angle that it sees [rad]."""
+    fov: float | None = None
+    """Vertical angle that it sees [rad]; 0.8 if omitted."""
     plate: Path | None = None
     """Picture of the background without the object; the median of the film if omitted."""
     fps_true: float | None = None
@@ -77,9 +85,7 @@ class Fit:
         if out.suffix.lower() != ".npz":
             raise ConfigError(f"out {out} is no .npz file", hint="name it like out/toy.npz")
         check_place(out, "twin")
-        for name in ("youngs_modulus", "friction"):
-            if getattr(self.toy, name) is not None:
-                raise ConfigError(f"--{name.replace('_', '-')} says nothing about a fit", hint="leave it out")
+        _refuse(self.toy, ("youngs_modulus", "friction"), "a fit")
         if self.toy.density is not None and self.mass is not None:
             raise ConfigError("--mass and --density are given", hint="give one of them")
         from softmode.cli.fit_scene import FitScene
@@ -119,21 +125,30 @@ class Fit:
         device = warp_device(self.device)
         table = self.file.suffix.lower() == ".csv"
         forces = table and holds_forces(self.file)
+        film = ("camera", "fov", "plate", "fps_true")
+        if forces:
+            _refuse(self, ("held", *film), "a force log")
+        elif table:
+            _refuse(self, ("press", "between", *film), "markers")
+        else:
+            _refuse(self, ("press", "between"), "a film")
+            if self.camera is None:
+                _refuse(self, ("fov",), "a film without --camera")
         base = ObjectConfig(surface_count=3000) if forces else ObjectConfig()
         config = self.toy.object_of(base)
-        made = config.material or Material(poissons_ratio=0.35)
+        told = config.material if config.body is None else load(config).material
+        made = told or Material(poissons_ratio=0.35)
         if scene.poissons_ratio is not None:
             made = dataclasses.replace(made, poissons_ratio=scene.poissons_ratio)
         free = load(config, material=made)
-        density, known = scene.density_of(free.body.volume)
+        density, known = scene.density_of(free.body.volume, made.density)
         material = dataclasses.replace(made, density=density)
         if forces:
             between = None if self.between is None else "xyz".index(self.between)
-            if (self.press is None) == (between is None):
-                hint = "give --press X Y Z --radius R, or --between y"
-                raise ConfigError("a force log, and not one way in which it was taken", hint=hint)
             press = Press(point=self.press, radius=self.radius, between=between)
-            return fit_force(free, read_forces(self.file), press, material=material, device=device), free, None
+            found = fit_force(free, read_forces(self.file), press, material=material, device=device)
+            note = f"the twin has {density:g} kg/m^3, which was not measured: give --mass"
+            return found if known else dataclasses.replace(found, notes=(*found.notes, note)), free, None
         if scene.held is None:
             raise ConfigError("held is not told", hint="say which end is held, like --held top:0.03")
         held = Held.parse(scene.held)
@@ -141,13 +156,14 @@ class Fit:
         thing = held_object(captured, held)
         if table:
             markers, places = read_markers(self.file), scene.places()
-            return fit_markers(thing, markers, places, material=material, device=device), free, None
+            found = fit_markers(thing, markers, places, material=material, device=device)
+            return found if known else found.unweighed(), free, None
         clip = Clip.read(self.file, fps_true=scene.fps)
         height, width = clip.frames.shape[1:3]
         if self.camera is not None:
             middle = (thing.body.bounds + thing.body.offset).mean(axis=0)
-            told = {"position": self.camera, "target": middle.tolist(), "fov_y": self.fov}
-            scene = dataclasses.replace(scene, camera=told)
+            view = {"position": self.camera, "target": middle.tolist(), "fov_y": 0.8 if self.fov is None else self.fov}
+            scene = dataclasses.replace(scene, camera=view)
         camera = scene.pinhole(width, height, clip.shrink)
         from tqdm import tqdm
 
@@ -164,12 +180,11 @@ class Fit:
                 held,
                 material=material,
                 plate=None if self.plate is None else clip.like(self.plate),
-                mass_known=known,
                 keep=self.twin.with_suffix(".fit.part.json"),
                 device=device,
                 progress=tell,
             )
-        return found, free, (residuals, x)
+        return found if known else found.unweighed(), free, (residuals, x)
 
     def _film(self, path: Path, residuals: Any, x: Any) -> None:
         """Write the film beside the twin."""

@@ -51,6 +51,11 @@ class FitScene:
         if self.kind not in KINDS:
             hint = f"hold it by one end and let it go, or press it with a scale: kind is one of {', '.join(KINDS)}"
             raise ConfigError(f"kind is {self.kind!r}: what is thrown, dropped or poked shows no E for sure", hint=hint)
+        kinds = {"held": str | None, "camera": dict, "markers": dict, "load": dict, "axes": list | tuple}
+        for name, kind in kinds.items():
+            if not isinstance(value := getattr(self, name), kind):
+                hint = "give held as text, camera, markers and load as objects, axes as a list"
+                raise ConfigError(f"scene: {name} is {value!r}", hint=hint)
         for name, example in (("mass", "0.142, in kg"), ("density", "300, in kg/m^3")):
             if (value := getattr(self, name)) is not None:
                 require_number(name, value, above=0.0, hint=f"give it like {example}", error=MaterialError)
@@ -79,16 +84,18 @@ class FitScene:
             told = {name: value for name, value in told.items() if name not in ("mass", "density")}
         return cls(**{**told, **given})
 
-    def density_of(self, volume: float) -> tuple[float, bool]:
-        """Return the density [kg/m^3] of an object of a volume [m^3], and whether it was told."""
+    def density_of(self, volume: float, otherwise: float) -> tuple[float, bool]:
+        """Return the density [kg/m^3] of an object of a volume [m^3], else another one, and whether it was told."""
         if self.mass is not None:
             return self.mass / volume, True
-        return (1000.0, False) if self.density is None else (self.density, True)
+        return (otherwise, False) if self.density is None else (self.density, True)
 
     def places(self) -> MarkerPlaces:
         """Return how markers lie on the object."""
         force, at = self.load.get("force", [0.0, 0.0, 0.0]), self.load.get("at")
         require_numbers("load force", force, 3)
+        if at is not None:
+            require_numbers("load at", at, 3)
         for name, point in self.markers.items():
             require_numbers(f"marker {name}", point, 3)
         return MarkerPlaces(points=self.markers, axes=self.axes, load=force, load_at=at)
@@ -108,12 +115,16 @@ class FitScene:
             if name in told:
                 require_numbers(f"camera {name}", told[name], count, hint=hint)
         place: Any = tuple(told["position"])
-        fov = float(told.get("fov_y", 0.8))
+        fov = told.get("fov_y", 0.8)
+        require_number("camera fov_y", fov, above=0.0, below=np.pi, hint=hint)
         target: Any = told.get("target", np.add(place, (0.0, 1.0, 0.0)))
         camera = PinholeCamera.look_at("film", position=place, target=target, fov_y=fov, width=width, height=height)
         if "quat" in told:
             camera = replace(camera, quat=tuple(told["quat"]))
         if "matrix" in told:
+            rows = told["matrix"]
+            for row in rows if isinstance(rows, list) and len(rows) == 3 else (rows,):
+                require_numbers("a row of the camera's matrix", row, 3, hint=hint)
             k = np.asarray(told["matrix"], float) * shrink
             camera = replace(camera, fx=k[0, 0], fy=k[1, 1], cx=k[0, 2], cy=k[1, 2])
         return camera

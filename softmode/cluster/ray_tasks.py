@@ -173,6 +173,7 @@ def _cluster(address: str, folder: Path) -> Iterator[tuple[Any, Callable[[], Non
             raise error.cause from None
         raise WorkerError(f"a worker failed: {error}", hint=hint) from error
     except (ray.exceptions.RayError, ConnectionError) as error:
-        raise WorkerError(f"the Ray cluster failed: {str(error).splitlines()[0]}", hint=hint) from error
+        message = str(error).partition("\n")[0]
+        raise WorkerError(f"the Ray cluster failed: {message}", hint=hint) from error
     finally:
         ray.shutdown()

@@ -71,6 +71,14 @@ class Fitted:
         """Return an estimate."""
         return self.estimates[name]
 
+    def unweighed(self) -> Fitted:
+        """Return what is known of an object whose mass is not: E over density, and E for the material's density."""
+        modulus, density = self["youngs_modulus"], self.material.density
+        over = {name: getattr(modulus, name) / density for name in ("value", "low", "high")}
+        estimates = {"youngs_modulus_over_density": replace(modulus, unit="m^2/s^2", **over), **self.estimates}
+        note = f"E is for {density:g} kg/m^3, which was not measured: give --mass for E"
+        return replace(self, estimates=estimates, notes=(*self.notes, note))
+
     @property
     def json(self) -> dict[str, Any]:
         """All of it, as JSON holds it."""

@@ -84,29 +84,33 @@ class Clip:
 
         Raises:
             AssetError: If it is missing or cannot be read.
-            FitError: If it is too short.
+            FitError: If it is too short, or longer than `LONGEST`.
         """
         cv2 = open_cv()
         if not path.is_file():
             raise AssetError(f"film {path}: no such file", hint="check the path")
-        found = list(_gif(path) if path.suffix.lower() == ".gif" else _video(path))
-        if not found:
+        frames, moments, shrink = [], [], 1.0
+        for time, frame in _gif(path) if path.suffix.lower() == ".gif" else _video(path):
+            if time > LONGEST:
+                hint = "cut it: a second before the object is let go, and one to three after"
+                raise FitError(f"film {path}: is longer than {LONGEST:g} s", hint=hint)
+            small = min(1.0, EDGE / max(frame.shape))
+            size = (round(small * frame.shape[1]), round(small * frame.shape[0]))
+            frames.append(cv2.resize(frame, size, interpolation=cv2.INTER_AREA) if small < 1.0 else frame)
+            moments.append(time)
+            shrink = size[0] / frame.shape[1]
+        if not frames:
             raise AssetError(f"film {path}: no frame can be read", hint="export it as .mp4 (H.264)")
-        times = np.array([time for time, _ in found])
-        times = times - times[0]
+        times = np.array(moments) - moments[0]
         if fps_true is not None:
             require_number("fps_true", fps_true, above=0.0, at_most=1.0e5, hint="give frames per second, like 240")
             times = times / (np.median(np.diff(times)) if len(times) > 1 else 1.0) / fps_true
-        height, width = found[0][1].shape[:2]
-        shrink = min(1.0, EDGE / max(height, width))
-        size = (round(shrink * width), round(shrink * height))
-        frames = [cv2.resize(f, size, interpolation=cv2.INTER_AREA) if shrink < 1.0 else f for _, f in found]
         return cls(
             frames=np.array(frames),
             times=times,
             name=str(path),
             fingerprint=file_fingerprint(path),
-            shrink=size[0] / width,
+            shrink=shrink,
         )
 
 
@@ -116,11 +120,10 @@ def _video(path: Path) -> Any:
     reader = cv2.VideoCapture(str(path))  # turns frames by the file's own flag, and gives 8 bits
     while True:
         good, frame = reader.read()
-        time = 1.0e-3 * reader.get(cv2.CAP_PROP_POS_MSEC)
-        if not good or time > LONGEST:
+        if not good:
             reader.release()
             return
-        yield time, frame[..., ::-1]
+        yield 1.0e-3 * reader.get(cv2.CAP_PROP_POS_MSEC), frame[..., ::-1]
 
 
 def _gif(path: Path) -> Any:
@@ -182,6 +185,12 @@ def find_mattes(clip: Clip, plate: Image | None) -> Mattes:
     return Mattes(cover=cover, noise=noise, release=release)
 
 
+def blurred(pictures: Array) -> NDArray[np.float32]:
+    """Return pictures (F, H, W) blurred by 1.2 px."""
+    cv2 = open_cv()
+    return np.array([cv2.GaussianBlur(p.astype(np.float32), (0, 0), 1.2) for p in pictures])
+
+
 def _solid(cover: Array) -> Array:
     """Return a matte without specks and small holes."""
     cv2 = open_cv()
@@ -206,8 +215,7 @@ def _check_background(clip: Clip, smooth: Array, noise: float) -> None:
 
 def _release(clip: Clip, cover: Array) -> int:
     """Return the last frame before anything moves; refuse a film in which nothing does."""
-    cv2 = open_cv()
-    soft = np.array([cv2.GaussianBlur(c.astype(np.float32), (0, 0), 1.2) for c in cover])
+    soft = blurred(cover)
     still = np.abs(np.diff(soft, axis=0)).reshape(len(soft) - 1, -1)
     flicker = float(np.median(np.sort(still.sum(axis=1))[: max(3, len(still) // 4)]))
     change = np.abs(soft - soft[0]).reshape(len(soft), -1).sum(axis=1)

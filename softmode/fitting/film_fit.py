@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from softmode.deformables.materials.material import Material
 from softmode.errors import FitError
 from softmode.fitting.estimates import Estimate, Fitted, floor_of
-from softmode.fitting.film import Clip, Image, find_mattes, open_cv
+from softmode.fitting.film import Clip, Image, blurred, find_mattes, open_cv
 from softmode.fitting.film_residuals import CAMERA, HOLDER, NAMES, FilmResiduals, film_space
 from softmode.fitting.holding import Held
 from softmode.fitting.kept import KeptStages
@@ -37,9 +37,9 @@ BEYOND = 5.0
 OVERLAP = 0.7
 """Least overlap of object and matte before anything moves, intersection over union."""
 FOLLOWED = 0.8
-"""Least share of the motion's cost that the twin has to explain, where more is left than"""
+"""Least share of the motion's cost that the twin has to explain, where more than `LEFT` is left."""
 LEFT = 0.2
-"""this root mean square of the coverage's residuals."""
+"""Root mean square of the coverage's residuals that is left where a twin may explain less than `FOLLOWED`."""
 _POSE = NAMES[CAMERA]
 _LASTING = (*_POSE, *NAMES[HOLDER], "edge")
 
@@ -52,7 +52,6 @@ def fit_film(
     *,
     material: Material,
     plate: Image | None = None,
-    mass_known: bool = True,
     keep: Path | None = None,
     device: wp.DeviceLike = None,
     progress: Progress | None = None,
@@ -64,9 +63,9 @@ def fit_film(
         clip: The film.
         camera: About where the camera is, in the axes of the object's file, for frames of the film's size.
         held: What is held.
-        material: Density and Poisson's ratio; the rest is where the fit begins.
+        material: Density and Poisson's ratio; the rest is where the fit begins. `Fitted.unweighed` tells what is known
+            where the density is not measured.
         plate: The picture without the object, of the film's size.
-        mass_known: Whether the density is measured; else only E over density is told.
         keep: File that keeps the stages that are done until all are; a fit that was cut off goes on with them.
         device: Warp device.
         progress: Told each stage and how far it is, 0..1.
@@ -111,7 +110,7 @@ def fit_film(
 
     tell("trying stiffnesses", 0.15)
     sets = np.repeat(np.where(np.arange(15) == 4, space.mean, pose)[None], len(SPECIFIC), axis=0)
-    sets[:, 0] = np.log(np.array(SPECIFIC) * material.density)
+    sets[:, 0] = np.log(SPECIFIC * material.density)
     costs = kept("costs", lambda: cost_of(residuals(sets)))
     none = sets[:1].copy()
     none[0, 4] = clip.times[-1]
@@ -150,7 +149,7 @@ def fit_film(
     shift = integrator_shift(thing, material, best.x, float(clip.times[-1] - best.x[4]), residuals.worlds.dt, device)
     x = best.x.copy()
     x[:2] -= shift
-    told = _told(thing, clip, space, best, x, residuals, mass_known, material, followed)
+    told = _told(thing, clip, space, best, x, residuals, material, followed)
     details = {
         "camera": dict(zip(_POSE, best.x[CAMERA].tolist(), strict=True)) | {"nominal": asdict(camera)},
         "start": float(best.x[4]),
@@ -161,8 +160,6 @@ def fit_film(
         "overlap": overlap,
         "residual_of_frames": np.round(np.sqrt((cover.reshape(len(every), -1) ** 2).mean(axis=1)), 4).tolist(),
         "integrator": {"youngs_modulus": float(np.exp(shift[0])), "viscosity": float(np.exp(shift[1]))},
-        "world_steps": residuals.worlds.steps,
-        "pictures": residuals.pictures.drawn,
     }
     kept.done()
     tell("done", 1.0)
@@ -172,7 +169,7 @@ def fit_film(
 def _check_grip(residuals: FilmResiduals, area: NDArray[np.bool_]) -> None:
     """Refuse a film in which what is held, an area (H, W), moves about as the rest does."""
     cv2 = open_cv()
-    soft = np.array([cv2.GaussianBlur(c.astype(np.float32), (0, 0), 1.2) for c in residuals.cover])
+    soft = blurred(residuals.cover)
     rim = cv2.dilate((np.hypot(*np.gradient(soft[0])) > 0.1).astype(np.uint8), np.ones((3, 3))) > 0
     moves = []
     for zone in (rim & area, rim & ~area):
@@ -193,7 +190,6 @@ def _told(
     best: Solution,
     x: Array,
     residuals: FilmResiduals,
-    mass_known: bool,
     material: Material,
     followed: float,
 ) -> Fitted:
@@ -203,7 +199,8 @@ def _told(
     at_end = min(x[0] - space.low[0], space.high[0] - x[0]) < 0.2
     why = "the film looks the same at every stiffness beyond it" if at_end else ""
     modulus = Estimate.of_logarithm(x[0], bar, unit="Pa", reason=why)
-    swings = "its motion dies, or is too small, before a second swing is seen" if deviation[1] > 0.5 else ""
+    dies = deviation[1] > 0.5 or best.x[1] > space.high[1] - 0.1
+    swings = "its motion dies, or is too small, before a second swing is seen" if dies else ""
     viscosity = Estimate.of_logarithm(x[1], float(np.hypot(deviation[1], 0.1)), unit="s", reason=swings)
     notes = [f"from {len(clip.times)} frames and {len(residuals.tracks)} tracks"]
     frequency = first_frequency(thing, float(np.exp(x[0])), material)
@@ -215,16 +212,10 @@ def _told(
     changes = {"youngs_modulus": modulus.value} if modulus.observable else {}
     if viscosity.observable:
         changes["viscosity"] = viscosity.value
-    estimates = {"youngs_modulus": modulus, "viscosity": viscosity}
-    if not mass_known:
-        over = {name: getattr(modulus, name) / material.density for name in ("value", "low", "high")}
-        ratio = replace(modulus, unit="m^2/s^2", **over)
-        estimates = {"youngs_modulus_over_density": ratio, **estimates}
-        notes.append(f"E is for {material.density:g} kg/m^3, which was not measured: give --mass for E")
     return Fitted(
         source=clip.name,
         fingerprint=clip.fingerprint,
-        estimates=estimates,
+        estimates={"youngs_modulus": modulus, "viscosity": viscosity},
         material=replace(material, **changes),
         notes=tuple(notes),
     )

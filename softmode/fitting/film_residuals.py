@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from softmode.deformables.materials.material import Material
-from softmode.fitting.film import Clip, Mattes, open_cv
+from softmode.fitting.film import Clip, Mattes, blurred, open_cv
 from softmode.fitting.least_squares import Space
 from softmode.fitting.pictures import CoverPictures, project
 from softmode.fitting.tracks import Track
@@ -96,10 +96,9 @@ class FilmResiduals:
         self._pixels = near & (self._small(mask[None])[0] > 0.99)
 
     @staticmethod
-    def _small(pictures: Array) -> Array:
+    def _small(pictures: Array) -> NDArray[np.float32]:
         """Return pictures blurred, every second pixel."""
-        cv2 = open_cv()
-        return np.array([cv2.GaussianBlur(p.astype(np.float32), (0, 0), 1.2)[::2, ::2] for p in pictures])
+        return blurred(pictures)[:, ::2, ::2]
 
     def states(self, sets: Array) -> Array:
         """Return coordinates of parameters (W, p) in the frames, shape (W, F, n, 3)."""

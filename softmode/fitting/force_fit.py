@@ -7,19 +7,26 @@ from dataclasses import dataclass, replace
 import newton
 import numpy as np
 import warp as wp
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import PchipInterpolator
 from scipy.optimize import least_squares
 
+from softmode.checks import require_number, require_numbers
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body
+from softmode.deformables.model.status import (
+    WORLD_COLLAPSED,
+    WORLD_CONTACT_OVERFLOW,
+    WORLD_NOT_FINITE,
+    status_reasons,
+)
 from softmode.deformables.model.tables import present
-from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
-from softmode.errors import ConfigError, FitError
+from softmode.deformables.solver.solver_reduced import SolverReduced
+from softmode.errors import ConfigError, FitError, SolverDiverged
 from softmode.fitting.estimates import Estimate, Fitted, floor_of
 from softmode.fitting.tables import ForceLog
-from softmode.objects.frame import file_frame
+from softmode.objects.frame import in_body
 from softmode.objects.soft_object import SoftObject
 from softmode.scenes.capture import capture_graph
 
@@ -32,6 +39,8 @@ STEP, RAMP, REST = 0.01, 40, 40
 """Step [s], steps while it presses, and steps until it lies still."""
 BALL = 0.12
 """Standard deviation of ln E that the contact of a ball leaves: against Hertz's law."""
+FAILED = WORLD_CONTACT_OVERFLOW | WORLD_NOT_FINITE | WORLD_COLLAPSED
+"""Status of a world whose force is none."""
 FOAM = 0.15
 """Relative change of E over the depth from which on one E does not fit."""
 
@@ -47,11 +56,21 @@ class Press:
     between: int | None = None
     """Axis along which jaws close, 0 to 2."""
 
+    def __post_init__(self) -> None:
+        """Refuse what is neither a ball nor two jaws."""
+        if (self.point is None) == (self.between not in (0, 1, 2)):
+            hint = "give --press X Y Z --radius R, or --between y"
+            raise ConfigError("a force log, and not one way in which it was taken", hint=hint)
+        if self.point is not None:
+            require_numbers("press", self.point, 3)
+        require_number("radius", self.radius, above=0.0, unit="m", hint="give it like 0.006")
+
     def forces(self, body: ReducedBody, material: Material, depths: Array, device: wp.DeviceLike = None) -> Array:
         """Return the forces at depths [m], each in a world of its own [N], shape (D,).
 
         Raises:
             ConfigError: If the point is not near the object.
+            SolverDiverged: If a depth is more than the body can be pressed.
         """
         low, high = body.surface.points.min(axis=0), body.surface.points.max(axis=0)
         wide = 2.0 * float((high - low).max())
@@ -63,19 +82,17 @@ class Press:
         axis = np.eye(3)[2 if self.between is None else self.between]
         behind = 0.5 * (low + high) - axis * (0.5 * float((high - low) @ axis) + wide)
         world.add_shape_box(-1, xform=wp.transform(tuple(behind), wp.quat_identity()), **plate)
-        if self.between is None:
-            start, toward = self._contact(body)
+        if self.point is not None:
+            start, toward = self._contact(body, self.point)
             world.add_shape_sphere(press, radius=self.radius, cfg=config)
         else:
             start, toward = low + high - behind, -axis
             world.add_shape_box(press, **plate)
         builder.replicate(world, len(depths))
         model = builder.finalize(device=device)
-        model.set_gravity(
-            (0.0, 0.0, 0.0)
-        )  # the file has the object as it rests, and forces are those beyond its weight
-        options = SolverReducedOptions(contact_max=2048)
-        solver, states = SolverReduced(model, [body], options=options), (model.state(), model.state())
+        # the file has the object as it rests, and forces are those beyond its weight
+        model.set_gravity((0.0, 0.0, 0.0))
+        solver, states = SolverReduced(model, [body]), (model.state(), model.state())
         poses = present(states[0].body_q).numpy()
         poses[:, 3:] = (0.0, 0.0, 0.0, 1.0)
 
@@ -95,13 +112,16 @@ class Press:
         for k in range((RAMP + REST) // 2):
             place(min(1.0, (2 * k + 2) / RAMP))
             graph.launch()
+        for depth, bits in zip(depths, solver.status.numpy(), strict=True):
+            if bits & FAILED:
+                what = f"{1e3 * depth:.3g} mm deep: {', '.join(status_reasons(int(bits)))}"
+                raise SolverDiverged(what, hint="check the units of the depths, the place and the size of the object")
         wrench = solver.body_wrench.numpy().reshape(len(depths), -1)[:, :3]
         return -(wrench @ toward)
 
-    def _contact(self, body: ReducedBody) -> tuple[Array, Array]:
-        """Return where the ball's centre is when it touches, and which way it goes, in the body frame."""
-        frame = file_frame(body)
-        point = frame[:3, :3] @ np.asarray(self.point, float) + frame[:3, 3]
+    def _contact(self, body: ReducedBody, place: ArrayLike) -> tuple[Array, Array]:
+        """Return where the ball's centre is when it touches a place of the file, and its way, in the body frame."""
+        point = in_body(body, place)
         off = np.linalg.norm(body.surface.points - point, axis=1)
         nearest = int(off.argmin())
         size = float(np.ptp(body.bounds, axis=0).max())
@@ -138,7 +158,9 @@ def fit_force(
         device: Warp device.
 
     Raises:
-        FitError: If no depth is pressed at which the body resists.
+        ConfigError: If the log has openings and a ball presses, or the ball is not near the object.
+        FitError: If no depth is pressed at which the body resists, or one between jaws is all of the object.
+        SolverDiverged: If a depth is more than the body can be pressed.
     """
     axis = press.between
     extent = float(np.ptp(thing.body.surface.points, axis=0)[axis]) if axis is not None else 0.0
@@ -150,6 +172,9 @@ def fit_force(
         what = f"{log.source}: {int(pressed.sum())} forces at depths > 0"
         raise FitError(what, hint="count the depth from the first touch, and check the size of the object")
     way, force = way[pressed], log.force[pressed]
+    if axis is not None and way.max() >= extent:
+        what = f"{log.source}: {1e3 * way.max():.3g} mm of an object that is {1e3 * extent:.3g} mm thick there"
+        raise FitError(what, hint="check the unit of the way and the size of the object")
     depths = way.max() * np.linspace(0.15, 1.0, DEPTHS)
     made = press.forces(thing.body, replace(material, youngs_modulus=START), depths, device)
     if not made.max() > 0.0:
@@ -183,7 +208,7 @@ def fit_force(
         source=log.source,
         fingerprint=log.fingerprint,
         estimates={"youngs_modulus": estimate},
-        material=replace(material, youngs_modulus=modulus),
+        material=replace(material, youngs_modulus=modulus) if estimate.observable else material,
         notes=tuple(notes),
         details={"depths": depths.tolist(), "forces": (factor * made).tolist(), "touch": shift},
     )

@@ -56,8 +56,6 @@ class Solution:
     """Their derivatives by the free parameters (M, k)."""
     prior: Array
     """Standard deviations of the priors of the free parameters (k,)."""
-    evaluations: int
-    """Jacobians that were evaluated."""
 
     def deviations(self, blocks: Sequence[NDArray[np.intp]]) -> Array:
         """Return standard deviations of the free parameters, (k,).
@@ -154,7 +152,6 @@ def minimise(
         residuals=r[:m],
         jacobian=J[:m],
         prior=prior,
-        evaluations=len(counted),
     )
 
 

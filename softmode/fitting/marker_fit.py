@@ -16,7 +16,7 @@ from softmode.fitting.film_fit import SPECIFIC
 from softmode.fitting.least_squares import Space, cost_of, minimise
 from softmode.fitting.tables import Markers
 from softmode.fitting.worlds import FitWorlds
-from softmode.objects.frame import file_frame
+from softmode.objects.frame import in_body
 from softmode.objects.soft_object import SoftObject
 
 Array = NDArray[np.float64]
@@ -52,12 +52,12 @@ class MarkerPlaces:
             ConfigError: If the axes are no right-handed three.
         """
         found = np.zeros((3, 3))
-        for row, axis in zip(found, self.axes, strict=False):
+        for row, axis in zip(found, map(str, self.axes), strict=False):
             if len(axis) == 2 and axis[0] in "+-" and axis[1] in "xyz":
                 row["xyz".index(axis[1])] = 1.0 if axis[0] == "+" else -1.0
         if len(self.axes) != 3 or not np.isclose(np.linalg.det(found), 1.0):
             hint = "say which axes of the markers are x, y and z of the object, right-handed, like +z -y +x"
-            raise ConfigError(f"axes are {' '.join(self.axes)}", hint=hint)
+            raise ConfigError(f"axes are {' '.join(map(str, self.axes))}", hint=hint)
         return found
 
 
@@ -89,8 +89,8 @@ class MarkerFit:
             hint = 'say where they are on the object: "markers": {"m0": [x, y, z], ...}'
             raise ConfigError("markers: none has a place", hint=hint)
         self.thing, self.places, self.material, self._dt, self._device = thing, places, material, dt, device
-        frame, body = file_frame(thing.body), thing.body
-        rest = self._in_body(np.array(list(places.points.values()), float))
+        body = thing.body
+        rest = in_body(body, list(places.points.values()))
         off = np.linalg.norm(rest[:, None] - body.surface.points, axis=2).min(axis=1)
         size = float(np.ptp(body.bounds, axis=0).max())
         if off.max() > 0.1 * size:
@@ -101,15 +101,10 @@ class MarkerFit:
         if any(places.load):
             if places.load_at is None:
                 raise ConfigError("load hangs nowhere", hint='say where: "load": {"force": [...], "at": [x, y, z]}')
-            at = self._in_body(np.array([places.load_at]))[0]
+            at = in_body(body, places.load_at)
             near = np.argsort(np.linalg.norm(body.surface.points - at, axis=1))[:LOADED]
             self._load = np.zeros((body.surface_count, 3))
-            self._load[near] = frame[:3, :3] @ np.array(places.load) / len(near)
-
-    def _in_body(self, points: Array) -> Array:
-        """Return places of the file (N, 3) in the body frame."""
-        frame = file_frame(self.thing.body)
-        return points @ frame[:3, :3].T + frame[:3, 3]
+            self._load[near] = np.array(places.load) / len(near)
 
     def moved(self, markers: Markers) -> Array:
         """Return how far the markers are from where they were before the release [m], (F, M, 3), in the object's axes.
@@ -129,10 +124,14 @@ class MarkerFit:
         return np.einsum("mk,wkc->wmc", self._basis, q[-1] - q[0])
 
     def fit_rest(self, rest: Array, about: float) -> float:
-        """Return the Young's modulus [Pa] with which the markers sag as far as they do at rest (M, 3), on average."""
+        """Return the Young's modulus [Pa] with which the markers sag as far as they do at rest (M, 3), on average.
+
+        NaN where no modulus from a half to twice a value that it is about [Pa] does.
+        """
         moduli = about * np.geomspace(0.5, 2.0, 8)
-        down = np.log(np.maximum(-self.sag(moduli)[:, :, 2].mean(axis=1), 1e-12))
-        return float(np.exp(np.interp(np.log(-rest[:, 2].mean()), down[::-1], np.log(moduli)[::-1])))
+        down, sag = np.maximum(-self.sag(moduli)[:, :, 2].mean(axis=1), 1e-12), max(-float(rest[:, 2].mean()), 1e-15)
+        at = np.interp(np.log(sag), np.log(down[::-1]), np.log(moduli)[::-1], left=np.nan, right=np.nan)
+        return float(np.exp(at))
 
     def fit_motion(self, markers: Markers) -> tuple[Array, Array, float]:
         """Fit the motion after the release.
@@ -161,7 +160,7 @@ class MarkerFit:
             return ((np.einsum("mk,wtkc->wtmc", self._basis, q) - moved[frames]) / noise).reshape(len(sets), -1)
 
         starts = np.repeat(space.mean[None], len(SPECIFIC), axis=0)
-        starts[:, 0] = np.log(np.array(SPECIFIC) * self.material.density)
+        starts[:, 0] = np.log(SPECIFIC * self.material.density)
         costs = cost_of(residuals(starts))
         best = min(
             (minimise(residuals, space, starts[k], NAMES, rounds=12) for k in np.argsort(costs)[:2]),
@@ -202,13 +201,16 @@ def fit_markers(
     notes = [f"what is left of the motion: {1e3 * left:.2g} mm rms"]
     tail = markers.times > markers.times[-1] - REST
     ways = np.linalg.norm(moved, axis=2)
-    changes: dict[str, float] = {"youngs_modulus": motion.value}
+    changes = {"youngs_modulus": motion.value} if motion.observable else {}
     if ways[tail].std(axis=0).max() < STILL * ways.max() and tail.sum() > 5:
         still = fit.fit_rest(moved[tail].mean(axis=0), motion.value)
-        at_rest = Estimate.of_logarithm(float(np.log(still)), PLACE, unit="Pa")
-        estimates = {"youngs_modulus": at_rest, "youngs_modulus_in_motion": motion}
-        changes["youngs_modulus"] = still
         stiffer = motion.value / still - 1.0
+        if np.isnan(still):
+            notes.append("where it rests needs less than half or more than twice that E: check axes and load")
+        else:
+            at_rest = Estimate.of_logarithm(float(np.log(still)), PLACE, unit="Pa")
+            estimates = {"youngs_modulus": at_rest, "youngs_modulus_in_motion": motion}
+            changes["youngs_modulus"] = still
         if abs(stiffer) > 3.0 * deviation[0]:
             word = "stiffer" if stiffer > 0 else "softer"
             notes.append(f"{word} in motion by {abs(stiffer):.0%}: the material is rate dependent")

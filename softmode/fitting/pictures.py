@@ -33,8 +33,6 @@ class CoverPictures:
         count = self._bound.arrays.means.shape[1]
         self._raster = SplatRasterizer(count, batch, camera.width, camera.height, device=device)
         self._views = ViewArrays.from_cameras([camera] * batch, world=range(batch), device=device)
-        self.drawn = 0
-        """Pictures so far."""
 
     def draw(self, q: Array, poses: Array, *, color: bool = False) -> NDArray[np.float32]:
         """Return the coverage 0..1 of states, shape (N, H, W), or their colours (N, H, W, 3).
@@ -52,7 +50,6 @@ class CoverPictures:
             self._raster.render(self._bound.arrays, self._views)
             picture = self._raster.rgb if color else self._raster.alpha
             found.append(picture.numpy()[: len(q) - first].copy())
-        self.drawn += len(q)
         return np.concatenate(found)
 
 

@@ -76,18 +76,20 @@ class Markers:
 
 def _rows(path: Path, what: str) -> tuple[list[str], Array]:
     """Return the titles of a table and its numbers."""
-    text = read_file(path, what).decode(errors="replace")
-    lines = [row for row in csv.reader(text.splitlines()) if row and not row[0].lstrip().startswith("#")]
+    text = read_file(path, what).decode("utf-8-sig", errors="replace")
+    try:
+        lines = [row for row in csv.reader(text.splitlines()) if row and not row[0].lstrip().startswith("#")]
+    except csv.Error as error:
+        raise AssetError(f"{what} {path}: {error}", hint="give numbers separated by commas below the titles") from error
     titles = [word.strip() for word in lines[0]] if lines else []
     if len(lines) < 4:
         raise AssetError(f"{what} {path}: holds {max(len(lines) - 1, 0)} rows", hint="give a title and rows of numbers")
+    if any(len(row) != len(titles) for row in lines):
+        raise AssetError(f"{what} {path}: rows differ in length", hint="give a number below each title")
     try:
-        found = np.array([[float(word) if word.strip() else np.nan for word in row] for row in lines[1:]])
+        return titles, np.array([[float(word) if word.strip() else np.nan for word in row] for row in lines[1:]])
     except ValueError as error:
         raise AssetError(f"{what} {path}: {error}", hint="give numbers separated by commas below the titles") from error
-    if found.ndim != 2 or found.shape[1] != len(titles):
-        raise AssetError(f"{what} {path}: rows differ in length", hint="give a number below each title")
-    return titles, found
 
 
 def read_markers(path: Path) -> Markers:

@@ -13,6 +13,7 @@ from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body
 from softmode.deformables.model.namespaces import soft
+from softmode.deformables.model.status import WORLD_NOT_FINITE
 from softmode.deformables.model.tables import present
 from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
 from softmode.deformables.tools.start import set_states
@@ -72,7 +73,6 @@ class FitWorlds:
         *,
         tilt: ArrayLike = (0.0, 0.0),
         every: int = 2,
-        progress: Callable[[], None] | None = None,
     ) -> tuple[Array, Array]:
         """Let the body go from its rest shape, without speed.
 
@@ -81,13 +81,12 @@ class FitWorlds:
             seconds: How long [s].
             tilt: Turns of gravity about x and y [rad], shape (2,) or (W, 2).
             every: Steps between two times that are kept; even.
-            progress: Told after each of them.
 
         Returns:
             Times (T,) [s] and coordinates (T, W, n, 3) [m].
 
         Raises:
-            SolverDiverged: If a world is no longer finite.
+            SolverDiverged: If a step of a world has no finite end.
         """
         sets = np.broadcast_arrays(*[np.atleast_1d(value) for value in parameters.values()], np.atleast_2d(tilt)[:, 0])
         worlds, whole = len(sets[0]), np.minimum(np.arange(self.count), len(sets[0]) - 1)
@@ -99,6 +98,7 @@ class FitWorlds:
         present(self._model.gravity)[: self.count].assign(gravity.astype(np.float32))
         if self._graph is None:
             self._graph = capture_graph(self._two_steps, self._model.device).launch
+        self._solver.status.zero_()
         for state in self._states:
             self._solver.reset(state)
             set_states(self._solver, state)
@@ -109,11 +109,9 @@ class FitWorlds:
             if k < count:
                 for _ in range(every // 2):
                     self._graph()
-            if progress is not None:
-                progress()
         self.steps += count * every * worlds
-        if not np.isfinite(found).all():
-            raise SolverDiverged("a world of the fit is no longer finite", hint="narrow the range of Young's modulus")
+        if (self._solver.status.numpy()[:worlds] & WORLD_NOT_FINITE).any():  # such a world is put at rest, finite
+            raise SolverDiverged("a world of the fit is no longer finite", hint="check --size, the mass and --held")
         return self.dt * every * np.arange(count + 1, dtype=np.float64), found
 
     def states(self, sets: Array, starts: Array, times: Array) -> Array:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from softmode.deformables.body.reduced_body import ReducedBody
 
@@ -22,6 +22,12 @@ def file_frame(body: ReducedBody) -> NDArray[np.float64]:
     frame = np.eye(4)
     frame[:3, :3], frame[:3, 3] = turn, -body.offset
     return frame
+
+
+def in_body(body: ReducedBody, points: ArrayLike) -> NDArray[np.float64]:
+    """Return places of an object's file [m], shape (..., 3), in the body frame."""
+    frame = file_frame(body)
+    return np.asarray(points, dtype=np.float64) @ frame[:3, :3].T + frame[:3, 3]
 
 
 def laid_down(body: ReducedBody) -> bool:

@@ -45,12 +45,12 @@ NONE = Trouble(light=0.0, noise=0.005, pose=0.0, colors=0.0, background=0.0, lat
 """A film without trouble."""
 
 
-def film_camera(thing: SoftObject, size: int = 128, away: float = 2.2) -> PinholeCamera:
+def film_camera(thing: SoftObject, size: int) -> PinholeCamera:
     """Return a camera that sees an object and where it may sag, in the axes of its file."""
     low, high = thing.body.bounds + thing.body.offset
     span, middle = float((high - low).max()), 0.5 * (low + high)
     target = (float(middle[0]), float(middle[1]), float(middle[2]) - 0.15 * span)
-    d = away * span
+    d = 2.2 * span
     place = (target[0] + 0.25 * d, target[1] - 0.95 * d, target[2] + 0.25 * d)
     return PinholeCamera.look_at("film", position=place, target=target, width=size, height=size, fov_y=0.75)
 
@@ -78,7 +78,6 @@ def make_film(
     *,
     seconds: float = 0.9,
     fps: int = 30,
-    still: int = 0,
     size: int = 128,
     dt: float = 1.0 / 960.0,
     moved: tuple[Array, newton.Model] | None = None,
@@ -92,7 +91,6 @@ def make_film(
         seed: Of all that is random.
         seconds: How long [s].
         fps: Frames per second.
-        still: Frames before it is let go.
         size: Width and height [px].
         dt: Steps of the truth [s].
         moved: The truth's motion at every second step, where it is another one's.
@@ -143,7 +141,7 @@ def make_film(
 
     late = trouble.late * r.uniform(0.0, 1.0) / fps
     exposure = np.linspace(-0.5, 0.5, 3) * trouble.blur / fps if trouble.blur else np.zeros(1)
-    times = (np.arange(int(seconds * fps) + still) - still) / fps + late
+    times = np.arange(int(seconds * fps)) / fps + late
     frames = np.array([sensor(np.mean([shot(max(t + s, 0.0)) for s in exposure], axis=0)) for t in times])
     soft(state).q.assign(thing.body.affine(np.eye(3), (0, 0, -50.0)))
     empty = picture()

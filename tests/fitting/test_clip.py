@@ -104,7 +104,7 @@ def test_what_is_told(tmp_path: Path) -> None:
     path = tmp_path / "scene.json"
     path.write_text('{"mass": 0.142, "held": "top:0.03", "camera": {"position": [0, -1, 0.2], "target": [0, 0, 0.1]}}')
     scene = FitScene.read(path, held="top:0.02")
-    assert scene.held == "top:0.02" and scene.density_of(0.5) == (0.284, True)
+    assert scene.held == "top:0.02" and scene.density_of(0.5, 300.0) == (0.284, True)
     assert scene.pinhole(128, 96, 1.0).position == (0, -1, 0.2)
     for text, match in (
         ('{"mess": 1}', "mess"),
