@@ -146,8 +146,8 @@ def record_on_ray(
             shards.remove()
     if len(wanted) < job["episodes"]:
         raise ConfigError(
-            f"only {len(counted)} of {len(outcomes)} episodes succeeded, {job['episodes']} were asked for; they are "
-            "recorded",
+            f"only {len(counted)} of {len(outcomes)} episodes succeeded, {job['episodes']} were asked for"
+            + ("; they are recorded" if counted else ""),
             hint="use a better policy, or record failures too",
         )
     return Recorded(episodes=len(counted), successes=sum(counted), attempts=wanted[-1] + 1)

@@ -94,6 +94,9 @@ class Fitted:
             title = name.replace("youngs_modulus", "Young's modulus").replace("_", " ")
             value = f"{scale * one.value:.3g} {unit} ({scale * one.low:.3g} to {scale * one.high:.3g})"
             found.append(f"{title}: {value}" if one.observable else f"{title}: not observable, because {one.reason}")
+        for name, one in self.estimates.items():
+            if not one.observable and hasattr(self.material, name):
+                found.append(f"the twin keeps {name} = {getattr(self.material, name):.3g} {one.unit}, which was not found")
         return [*found, *self.notes]
 
     def write(self, path: Path) -> None:

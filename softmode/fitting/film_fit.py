@@ -151,6 +151,7 @@ def fit_film(
     x[:2] -= shift
     told = _told(thing, clip, space, best, x, residuals, material, followed)
     details = {
+        "converged": best.converged,
         "camera": dict(zip(_POSE, best.x[CAMERA].tolist(), strict=True)) | {"nominal": asdict(camera)},
         "start": float(best.x[4]),
         "followed": followed,

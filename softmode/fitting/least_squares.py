@@ -48,6 +48,8 @@ class Solution:
     """Parameters (p,)."""
     free: NDArray[np.intp]
     """Which of them were free (k)."""
+    converged: bool
+    """Whether it ended because little changed, and not after the last round."""
     cost: float
     """Half the sum of what the residuals and the priors cost."""
     residuals: Array
@@ -148,6 +150,7 @@ def minimise(
     return Solution(
         x=x,
         free=which,
+        converged=found.status > 0,
         cost=float(found.cost),
         residuals=r[:m],
         jacobian=J[:m],
