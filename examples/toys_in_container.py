@@ -105,12 +105,12 @@ def main() -> None:
     parser.add_argument("--presets", action="store_true", help="objects of the library")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--device")
-    parser.add_argument("--short", action="store_true", help="1.2 s in small pictures, not 2 s")
+    parser.add_argument("--short", action="store_true", help="1.6 s in small pictures, not 2 s")
     given = parser.parse_args()
     wp.config.log_level = wp.LOG_WARNING
     scene = make_scene(given.splat, given.seed, 160 if given.short else 480, given.device, given.presets)
     with Film(given.video) as film:
-        record = scene.record(film, 36 if given.short else 60, depth_in_walls)
+        record = scene.record(film, 48 if given.short else 60, depth_in_walls)
         film.publish()
     print(f"{record}\nwrote {film.path} and {film.sheet_path}")
     test_final(scene, record)
