@@ -54,7 +54,7 @@ def test_jaws_against_finite_elements() -> None:
 
 @pytest.mark.rest
 def test_ball_against_hertz() -> None:
-    """A ball on a block presses as Hertz's, F = 4/3 E / (1 - nu^2) sqrt(R) d^(3/2), of a finite thickness: E within 10 %.
+    """A ball on a block presses as Hertz's, F = 4/3 E / (1 - nu^2) sqrt(R) d^(3/2), of its thickness: E within 10 %.
 
     The thickness h adds 1 + y + y^2, y = .694 (3 - 2 nu) / (1 - nu) sqrt(R d) / (pi h): a layer that slides, to second
     order (Dimitriadis et al. 2002, doi:10.1016/S0006-3495(02)75620-8). R is five times the distance of the samples.
