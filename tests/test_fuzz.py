@@ -21,7 +21,7 @@ def test_damaged_files() -> None:
     assert total(tallies, "refused") > 80 and total(tallies, "loaded") > 10
 
 
-@pytest.mark.rest
+@pytest.mark.slow
 def test_damaged_files_at_length() -> None:
     """2,000 other damaged files over all formats; each refuses some, and those without checksums load some."""
     tallies, findings = run(2000, seed=1)

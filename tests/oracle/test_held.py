@@ -11,7 +11,14 @@ import pytest
 from tests.marks import rest_but
 from tests.oracle.held import STORED, TETRAHEDRA, against_elements, build_held
 
-CASES = [(name, float(ratio)) for name, ratios in json.loads(STORED.read_text()).items() for ratio in ratios]
+RATIOS = (0.3, 0.49)
+"""Poisson's ratios of the tests; ``python -m benchmarks.modes --held`` has what lies between."""
+CASES = [
+    (name, float(ratio))
+    for name, ratios in json.loads(STORED.read_text()).items()
+    for ratio in ratios
+    if float(ratio) in RATIOS
+]
 
 
 @pytest.mark.parametrize(("name", "poissons_ratio"), rest_but([("plate, one edge", 0.3)], CASES))
