@@ -31,7 +31,17 @@ OPTIONAL = (
         "imageio_ffmpeg",
         "tyro",
     ),
-    *("cv2", "pxr", "newton_usd_schemas", "rerun", "viser", "matplotlib", "mujoco_menagerie", "backports", "compression"),
+    *(
+        "cv2",
+        "pxr",
+        "newton_usd_schemas",
+        "rerun",
+        "viser",
+        "matplotlib",
+        "mujoco_menagerie",
+        "backports",
+        "compression",
+    ),
 )
 """Modules that only extras bring; `compression` is where Python 3.14 keeps Zstandard."""
 

@@ -83,9 +83,7 @@ def test_placing_is_worth_more_than_any_part_of_it(make_env: MakeEnv) -> None:
 
 
 @rest
-@pytest.mark.parametrize(
-    ("name", "count"), [("PlaceInBin", 4), *((name, 2) for name in TASKS if name != "PlaceInBin")]
-)
+@pytest.mark.parametrize(("name", "count"), [("PlaceInBin", 4), *((name, 2) for name in TASKS if name != "PlaceInBin")])
 def test_success_is_worth_more_than_any_part_of_it(make_env: MakeEnv, name: str, count: int) -> None:
     """The order of values of every task, on medians over seeds."""
     check_order(make_env(name).unwrapped, name, range(count))
