@@ -103,7 +103,7 @@ def test_spec_and_pickle(make_env: MakeEnv, task: str) -> None:
     spec = gym.spec(task)
     assert spec.entry_point and spec.vector_entry_point and spec.max_episode_steps
     assert not spec.additional_wrappers and not spec.nondeterministic
-    env = make_env(name_of(task)).unwrapped
+    env: Any = make_env(name_of(task)).unwrapped
     assert len(pickle.dumps(env)) < 20_000
     told = env_spec(task, config=env.config)  # ... and without being made it is known what it observes
     assert (told.observation_space, told.action_space) == (env.observation_space, env.action_space)
