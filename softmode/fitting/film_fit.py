@@ -98,7 +98,7 @@ def fit_film(
     tell("finding the camera", 0.05)
     still = np.unique(np.linspace(0, mattes.release, 3).astype(int))
     residuals.frames = still
-    posed = replace(space, mean=np.where(np.arange(15) == 4, clip.times[-1], space.mean), high=np.full(15, np.inf))
+    posed = replace(space, mean=space.changed(space.mean, "start", clip.times[-1]), high=np.full(len(NAMES), np.inf))
     pose = kept("pose", lambda: minimise(residuals, posed, posed.mean, (*_POSE, "edge"), rounds=6).x)
     mask, overlap = _compared(residuals, pose, mattes.cover[0], held)
     if overlap < OVERLAP:
@@ -109,13 +109,12 @@ def fit_film(
     residuals.frames, residuals.moving = early, True
 
     tell("trying stiffnesses", 0.15)
-    sets = np.repeat(np.where(np.arange(15) == 4, space.mean, pose)[None], len(SPECIFIC), axis=0)
+    sets = np.repeat(space.changed(pose, "start", space.mean[NAMES.index("start")])[None], len(SPECIFIC), axis=0)
     sets[:, 0] = np.log(SPECIFIC * material.density)
     costs = kept("costs", lambda: cost_of(residuals(sets)))
-    none = sets[:1].copy()
-    none[0, 4] = clip.times[-1]
+    none = space.changed(sets[0], "start", clip.times[-1])[None]
     motion = ("youngs_modulus", "viscosity", "start", *_POSE, "edge")
-    tight = replace(space, prior=np.where(np.arange(15) == 1, 0.5, space.prior))
+    tight = replace(space, prior=space.changed(space.prior, "viscosity", 0.5))
 
     def refined(space: Space, start: Array, names: Sequence[str]) -> Array:
         """Return the cost and the parameters near a start."""

@@ -32,6 +32,8 @@ STATIC_SHARE = 0.9
 """How much of the mean over time is taken off: what is wrong in every frame is no motion."""
 COVER_NOISE, TRACK_NOISE = 0.25, 0.5
 """Standard deviations of coverage, and of tracks [px]."""
+WORLDS, STEP = 5, 1.0 / 240.0
+"""Worlds that run at a time: one place and its derivatives by four numbers; and their step [s]."""
 HOLDER_TIME = 0.08
 """How fast the holder gives way at release [s]."""
 
@@ -56,8 +58,6 @@ class FilmResiduals:
         clip: The film.
         mattes: What covers its background.
         camera: Where the camera should be, in the axes of the body frame, for the size of the film.
-        worlds: Worlds at a time.
-        dt: Step [s].
         device: Warp device.
     """
 
@@ -69,13 +69,11 @@ class FilmResiduals:
         mattes: Mattes,
         camera: PinholeCamera,
         *,
-        worlds: int = 5,
-        dt: float = 1.0 / 240.0,
         device: wp.DeviceLike = None,
     ) -> None:
         """Allocate the worlds and the pictures."""
         self.thing, self.camera, self.clip = thing, camera, clip
-        self.worlds = FitWorlds(thing.body, material, worlds, dt=dt, device=device)
+        self.worlds = FitWorlds(thing.body, material, WORLDS, dt=STEP, device=device)
         self.pictures = CoverPictures(thing, camera, device=device)
         self.after: Callable[[], None] = lambda: None
         """Called after each batch."""

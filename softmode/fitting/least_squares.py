@@ -16,6 +16,8 @@ KEPT = 3
 """Jacobians for which lasting derivatives are kept."""
 HUBER = 2.5
 """Residuals beyond this count by their size and not by its square."""
+TOLERANCE = 1.0e-3
+"""Relative change of the cost, and of the parameters in their priors, at which it ends."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -34,6 +36,10 @@ class Space:
     """Least values (p,)."""
     high: Array
     """Largest values (p,)."""
+
+    def changed(self, values: Array, name: str, value: float) -> Array:
+        """Return values (p,) with another one of a parameter."""
+        return np.where(np.arange(len(self.names)) == self.names.index(name), value, values)
 
     def index(self, *names: str) -> NDArray[np.intp]:
         """Return where parameters are."""
@@ -87,7 +93,6 @@ def minimise(
     *,
     rounds: int,
     lasting: Sequence[str] = (),
-    tolerance: float = 1.0e-3,
 ) -> Solution:
     """Find the parameters of least residuals near a start.
 
@@ -98,7 +103,6 @@ def minimise(
         free: Which of them may change.
         rounds: Jacobians at most.
         lasting: Those whose derivatives hardly change: they are kept for `KEPT` Jacobians.
-        tolerance: Relative change of the cost, and of the parameters in their priors, at which it ends.
     """
     which = space.index(*free)
     prior, mean = space.prior[which], space.mean[which]
@@ -139,8 +143,8 @@ def minimise(
         loss="huber",
         f_scale=HUBER,
         x_scale=np.where(np.isfinite(prior), prior, 1.0),
-        ftol=tolerance,
-        xtol=tolerance,
+        ftol=TOLERANCE,
+        xtol=TOLERANCE,
         max_nfev=rounds,
     )
     r, J = batch(found.x)

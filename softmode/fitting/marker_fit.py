@@ -27,6 +27,8 @@ STILL = 0.02
 """Speed below which it hangs still, over the largest way per second."""
 PLACE = 0.02
 """Standard deviation of ln E for where the markers and the clamp are: 3 mm of overhang of 100 are 4.5 % of E."""
+STEP = 1.0 / 400.0
+"""Step of the worlds [s]."""
 LOADED = 24
 """Surface samples that a load is spread over."""
 
@@ -68,7 +70,6 @@ class MarkerFit:
         thing: The object with its end held, see `held_object`.
         places: How markers lie on it.
         material: Density and Poisson's ratio.
-        dt: Step [s].
         device: Warp device.
 
     Raises:
@@ -81,14 +82,13 @@ class MarkerFit:
         places: MarkerPlaces,
         *,
         material: Material,
-        dt: float = 1.0 / 400.0,
         device: wp.DeviceLike = None,
     ) -> None:
         """Find the functions at the markers."""
         if not places.points:
             hint = 'say where they are on the object: "markers": {"m0": [x, y, z], ...}'
             raise ConfigError("markers: none has a place", hint=hint)
-        self.thing, self.places, self.material, self._dt, self._device = thing, places, material, dt, device
+        self.thing, self.places, self.material, self._device = thing, places, material, device
         body = thing.body
         rest = in_body(body, list(places.points.values()))
         off = np.linalg.norm(rest[:, None] - body.surface.points, axis=2).min(axis=1)
@@ -144,7 +144,7 @@ class MarkerFit:
         last = min(len(moved) - 1, int(np.searchsorted(markers.times, release + 1.5)))
         frames = np.arange(markers.release, last + 1)
         times, noise = markers.times[frames], max(markers.noise, 2.0e-4)
-        worlds = FitWorlds(self.thing.body, self.material, 5, dt=self._dt, load=self._load, device=self._device)
+        worlds = FitWorlds(self.thing.body, self.material, 5, dt=STEP, load=self._load, device=self._device)
         interval = float(np.median(np.diff(markers.times)))
         space = Space(
             names=NAMES,

@@ -12,6 +12,8 @@ from softmode.splats.raster.pinhole import PinholeCamera
 from softmode.splats.raster.rasterizer import SplatRasterizer, ViewArrays
 
 Array = NDArray[np.float64]
+BATCH = 64
+"""Pictures at a time."""
 
 
 class CoverPictures:
@@ -20,19 +22,16 @@ class CoverPictures:
     Args:
         thing: The object.
         camera: The lens; where it stands is told with each picture.
-        batch: Pictures at a time.
         device: Warp device.
     """
 
-    def __init__(
-        self, thing: SoftObject, camera: PinholeCamera, *, batch: int = 64, device: wp.DeviceLike = None
-    ) -> None:
+    def __init__(self, thing: SoftObject, camera: PinholeCamera, *, device: wp.DeviceLike = None) -> None:
         """Upload the splats."""
-        self._batch, self._device = batch, device
-        self._bound = BoundSplats(None, [thing], worlds=range(batch), sh_degree=0, device=device)
+        self._device = device
+        self._bound = BoundSplats(None, [thing], worlds=range(BATCH), sh_degree=0, device=device)
         count = self._bound.arrays.means.shape[1]
-        self._raster = SplatRasterizer(count, batch, camera.width, camera.height, device=device)
-        self._views = ViewArrays.from_cameras([camera] * batch, world=range(batch), device=device)
+        self._raster = SplatRasterizer(count, BATCH, camera.width, camera.height, device=device)
+        self._views = ViewArrays.from_cameras([camera] * BATCH, world=range(BATCH), device=device)
 
     def draw(self, q: Array, poses: Array, *, color: bool = False) -> NDArray[np.float32]:
         """Return the coverage 0..1 of states, shape (N, H, W), or their colours (N, H, W, 3).
@@ -43,8 +42,8 @@ class CoverPictures:
             color: Whether colours are wanted.
         """
         found = []
-        for first in range(0, len(q), self._batch):
-            rows = np.minimum(np.arange(first, first + self._batch), len(q) - 1)
+        for first in range(0, len(q), BATCH):
+            rows = np.minimum(np.arange(first, first + BATCH), len(q) - 1)
             self._views.world_to_camera.assign(poses[rows].astype(np.float32))
             self._bound.move(wp.array(q[rows].reshape(-1, 3), dtype=wp.vec3d, device=self._device))
             self._raster.render(self._bound.arrays, self._views)

@@ -34,7 +34,6 @@ class FitWorlds:
         material: What is the same in all worlds.
         count: Number of worlds.
         dt: Step [s].
-        tolerance: Newton's.
         load: Force on each surface sample [N], shape (surface_count, 3); None for none.
         device: Warp device.
     """
@@ -46,7 +45,6 @@ class FitWorlds:
         count: int,
         *,
         dt: float,
-        tolerance: float = 1.0e-5,
         load: Array | None = None,
         device: wp.DeviceLike = None,
     ) -> None:
@@ -58,7 +56,7 @@ class FitWorlds:
         self.steps = 0
         """Steps of worlds so far."""
         model = builder.finalize(device=device)
-        options = SolverReducedOptions(integrator="bdf2", tolerance=tolerance)
+        options = SolverReducedOptions(integrator="bdf2")
         self._model, self._solver = model, SolverReduced(model, [body], options=options)
         self._states, self._control = (model.state(), model.state()), model.control()
         self._graph: Callable[[], None] | None = None
