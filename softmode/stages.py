@@ -87,9 +87,13 @@ def compiled() -> None:
 
 
 def _print(name: str, seconds: float) -> None:
-    """Write a line, above the bars that there are."""
+    """Write a line, above the bars that there are.
+
+    It does not wait for their lock: a process that was killed while it held the lock would silence this one for good.
+    """
     line = f"softmode: {name}, {seconds:.0f} s"
-    if "tqdm" in sys.modules:
-        sys.modules["tqdm"].tqdm.write(line, file=sys.stderr)
+    bars = getattr(sys.modules.get("tqdm"), "tqdm", None)  # the module may be half imported
+    if bars is not None and getattr(bars, "_instances", None):
+        bars.write(line, file=sys.stderr, nolock=True)
     else:
         print(line, file=sys.stderr, flush=True)

@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 import warp as wp
+from tqdm import tqdm
 
 from softmode import stages
 from softmode.cli.common import quiet_warp
@@ -94,6 +95,18 @@ def test_a_long_stage_is_named_again_and_again(monkeypatch: pytest.MonkeyPatch) 
                 pass
         while wait() != "making":
             pass
+
+
+def test_a_stage_is_told_above_the_bars(capsys: pytest.CaptureFixture[str]) -> None:
+    """One line on stderr, with a bar and without one, also while another process holds the lock of the bars."""
+    stages._print("making", 4.2)
+    with tqdm(total=2, file=sys.stderr), tqdm.get_lock():
+        speaker = threading.Thread(target=stages._print, args=("filling", 5.0), daemon=True)
+        speaker.start()
+        speaker.join(20.0)
+        assert not speaker.is_alive()
+    err = capsys.readouterr().err
+    assert "softmode: making, 4 s\n" in err and "softmode: filling, 5 s\n" in err
 
 
 def test_every_module_that_launches_is_quiet() -> None:
