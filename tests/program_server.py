@@ -86,7 +86,7 @@ def _become(request: dict[str, Any]) -> int:
     except BaseException:
         traceback.print_exc()
         code = 1
-    threading._shutdown()  # pyright: ignore[reportAttributeAccessIssue]
+    threading._shutdown()
     atexit._run_exitfuncs()
     sys.stdout.flush()
     sys.stderr.flush()

@@ -13,6 +13,7 @@ import pytest
 
 from softmode.cli.main import main
 from tests import faults
+from tests.marks import rest_but
 from tests.needs import needs
 
 HELD = """
@@ -84,7 +85,7 @@ def test_a_body_that_is_not_built_is_not_written(tmp_path: Path, monkeypatch: py
 
     def build(*arguments: object, **given: object) -> object:
         begun.set()
-        return real(*arguments, **given)  # pyright: ignore[reportArgumentType]
+        return real(*arguments, **given)
 
     monkeypatch.setattr(loader, "build_object", build)
     with faults.signalled(signal.SIGTERM, begun.is_set):
@@ -109,9 +110,8 @@ def gone(session: int, seconds: float = 20.0) -> bool:
     return False
 
 
-@pytest.mark.rest
 @needs("torch")
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("number", rest_but([], [signal.SIGTERM, signal.SIGKILL], slow=[signal.SIGTERM]))
 def test_processes_that_hold_worlds_end_with_training(tmp_path: Path, number: signal.Signals) -> None:
     """None is left whether the parent ends or is killed, and a run that was asked to end can go on."""
     folder = tmp_path / "run"

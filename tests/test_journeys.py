@@ -23,7 +23,6 @@ from tests.needs import needs
 ROOT = Path(__file__).resolve().parents[1]
 SILENCE = 30.0
 """Seconds without a word that a user takes for a hang: three are promised on a machine that does nothing else."""
-pytestmark = pytest.mark.rest
 
 
 @pytest.fixture
@@ -56,6 +55,7 @@ def go(folder: Path, *words: str) -> str:
     return text
 
 
+@pytest.mark.rest
 @needs("imageio_ffmpeg")
 def test_the_film_of_an_own_capture(tmp_path: Path, toy: Path) -> None:
     """The arm lifts it, and the film is there."""
@@ -64,6 +64,7 @@ def test_the_film_of_an_own_capture(tmp_path: Path, toy: Path) -> None:
     assert (tmp_path / "toy.mp4").stat().st_size > 10_000
 
 
+@pytest.mark.rest
 @needs("tyro")
 @pytest.mark.skipif("aloha_arm" not in available(), reason="this mujoco-warp ships no ALOHA arm")
 def test_an_own_arm_and_an_own_toy(tmp_path: Path, toy: Path) -> None:
@@ -72,6 +73,7 @@ def test_an_own_arm_and_an_own_toy(tmp_path: Path, toy: Path) -> None:
     assert go(tmp_path, *play, "--size", "0.06", "--episodes", "4").count("success: True") >= 3
 
 
+@pytest.mark.slow
 @needs("torch", "tyro")
 def test_a_policy_for_an_own_toy_is_started(tmp_path: Path, toy: Path) -> None:
     """A run has played its first episodes and written a checkpoint."""

@@ -73,8 +73,7 @@ def test_native_code_is_refused() -> None:
     """A function whose body is C++ has no source that could be read."""
 
     @wp.func_native(snippet="return x;")
-    def same(x: wp.float64) -> wp.float64:  # pyright: ignore[reportReturnType]
-        ...
+    def same(x: wp.float64) -> wp.float64: ...
 
     with pytest.raises(LanesError, match=r"same is native code.*Write it in Warp"):
         lanes_code(same)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import warp as wp
 from newton.solvers import SolverBase, SolverMuJoCo
-from newton.solvers.experimental.coupled import ModelView  # pyright: ignore[reportMissingImports]
+from newton.solvers.experimental.coupled import ModelView
 
 from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
 from softmode.deformables.materials.material import Material

@@ -228,7 +228,7 @@ def test_files_and_refusals(make_env: MakeEnv, tmp_path: Path) -> None:
         ("state.npz", "state is a str"),
     ):
         with pytest.raises(StateError, match=message):
-            env.set_state(bad)  # pyright: ignore[reportArgumentType]
+            env.set_state(bad)
     for options in ({"state": state, "yaw": 0.1}, {"state": state.worlds([0, 0])}):
         with pytest.raises(ConfigError, match=r"excludes|2 worlds"):
             env.reset(options=options)

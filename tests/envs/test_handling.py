@@ -21,7 +21,7 @@ DOWN = np.array([0.0, 0.0, -1.0, 0.0, -1.0], np.float32)
 @wp.kernel
 def strains_of(G: wp.array[wp.mat33], out: wp.array[float]):
     """Evaluate the principal strain."""
-    out[wp.tid()] = principal_strain(G[wp.tid()])  # pyright: ignore[reportIndexIssue]
+    out[wp.tid()] = principal_strain(G[wp.tid()])
 
 
 def strain_of(F: np.ndarray) -> np.ndarray:

@@ -237,7 +237,7 @@ def test_bad_shapes() -> None:
     """What cannot act is named with what helps."""
     model, _ = moving_box()
     with pytest.raises(ConfigError, match=r"boundary.*glue"):
-        GridShapes(model, boundary="glue")  # pyright: ignore[reportArgumentType]
+        GridShapes(model, boundary="glue")
     with pytest.raises(ConfigError, match="one word for each of 2"):
         GridShapes(model, boundary=["slip"])
     with pytest.raises(ConfigError, match="no shape collides"):

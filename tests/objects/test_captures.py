@@ -57,6 +57,7 @@ def test_shells_are_what_they_say(name: str) -> None:
             *(("torus", 4e-4), ("cup", 4e-4), ("tube", 5e-5), ("plate", 1e-3)),
             *(("slab", 1e-3), ("ring", 4e-4), ("bowl", 4e-4)),
         ],
+        slow=[("torus", 4e-4), ("tube", 5e-5), ("slab", 1e-3), ("bowl", 4e-4)],
     ),
 )
 def test_shells_are_filled_to_their_volume(name: str, sigma: float) -> None:
@@ -97,8 +98,8 @@ def test_what_may_be_hollow_and_was_filled_is_a_warning(name: str) -> None:
     assert finding.severity == "warning" and "give a mesh" in finding.remedy
 
 
-SLOW = ("dense", "mug", "millimetres")
-"""Captures that take long to make or fill."""
+SLOW = ("dense", "mug", "millimetres", "handle", "sparse", "floaters")
+"""Captures that take long to make or fill, or are much like others."""
 
 
 @pytest.mark.parametrize(
@@ -153,8 +154,7 @@ def test_a_mutilated_capture_is_a_warning() -> None:
     assert [finding.severity for finding in found] == ["warning"] and "--resolution" in found[0].remedy
 
 
-@pytest.mark.parametrize("wall", [1e-3, 2e-3, 3e-3])
-@pytest.mark.rest
+@pytest.mark.parametrize("wall", rest_but([], [1e-3, 2e-3, 3e-3], slow=[1e-3, 3e-3]))
 def test_thin_walled_cups_build(wall: float) -> None:
     """Cups of 80 mm with walls of 1, 2 and 3 mm, as meshes, with default options.
 

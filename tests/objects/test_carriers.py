@@ -148,13 +148,13 @@ def test_bad_captures_are_refused() -> None:
 
 
 @pytest.mark.rest
-@pytest.mark.parametrize(("kind", "least"), [("smooth", 12), ("rough", 2), ("bare", 6), ("room", 2), ("held", 3)])
+@pytest.mark.parametrize(("kind", "least"), [("smooth", 6), ("rough", 1), ("bare", 3), ("room", 1), ("held", 1)])
 def test_made_captures(kind: str, least: int) -> None:
     """Of smooth carriers 95 % come off, of rough ones 70; most bare things stay whole; rooms are named, hands refused.
 
-    A third of each set is enough to see what breaks; ``python -m benchmarks.carriers`` judges whole sets.
+    A sixth of each set is enough to see what breaks; ``python -m benchmarks.carriers`` judges whole sets.
     """
     first, count = SEEDS[kind]
-    found = [judge(MADE[kind](seed), kind) for seed in range(first, first + -(-count // 3))]
+    found = [judge(MADE[kind](seed), kind) for seed in range(first, first + -(-count // 6))]
     assert sum(one.right for one in found) >= least
     assert sum(not one.right and not one.doubted for one in found) <= 1

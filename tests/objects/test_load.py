@@ -76,7 +76,7 @@ def test_a_body_is_covered_and_keeps_its_material(cup: Path) -> None:
 def test_what_is_no_source_is_refused() -> None:
     """A source of another type is named."""
     with pytest.raises(TypeError, match="ndarray"):
-        load(np.zeros((3, 3)))  # pyright: ignore[reportArgumentType]
+        load(np.zeros((3, 3)))
 
 
 def test_an_object_without_splats_says_so(cup: Path) -> None:

@@ -373,7 +373,7 @@ def _tetrahedra(name: str) -> Held:
         tip, width = (0.075, -0.0105, 0.0), 0.006
 
     def elements() -> tuple[Any, Callable[[Array], Mask]]:
-        import tetgen  # pyright: ignore[reportMissingImports]
+        import tetgen
         from skfem import MeshTet
 
         free = less(solid, box(lower, upper))
@@ -413,7 +413,7 @@ SOLIDS: dict[str, Callable[[], Held]] = {
 
 def solve(name: str, poissons_ratio: float) -> dict[str, Any]:
     """Return what finite elements give."""
-    import pypardiso  # pyright: ignore[reportMissingImports]
+    import pypardiso
     import scipy.sparse as sp
     from scipy.sparse.linalg import LinearOperator, eigsh
     from skfem import (

@@ -21,7 +21,13 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize(("name", "poissons_ratio"), rest_but([("plate, one edge", 0.3)], CASES))
+REST = {(name, 0.3) for name in ("plate, two edges", "spiral, points", "ribbon", "Y", "hand")}
+"""Cases that `make test-rest` runs: a plate, points, a twist, a branch, a mesh of tetrahedra. The others are slow."""
+
+
+@pytest.mark.parametrize(
+    ("name", "poissons_ratio"), rest_but([("plate, one edge", 0.3)], CASES, slow=set(CASES) - REST)
+)
 def test_loads_and_frequencies(name: str, poissons_ratio: float) -> None:
     """Gravity along every axis, loads spread over the end, and the first frequencies are those of finite elements."""
     if name in TETRAHEDRA:

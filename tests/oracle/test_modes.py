@@ -94,7 +94,7 @@ def test_few_points_are_not_soft() -> None:
     assert -0.02 < low and high < 0.03
 
 
-@pytest.mark.rest
+@pytest.mark.slow
 def test_more_functions_never_make_a_fork_stiffer() -> None:
     """The functions of a smaller number are the first of a larger one, so that with all points no frequency rises."""
     quadrature = quadrature_from_mesh(*SOLIDS["fork"]().surface(), point_count=1500)

@@ -150,7 +150,7 @@ def test_policies_and_refusals(soft_env: Callable[..., gym.Env]) -> None:
     assert env is soft_env(PRESS, obs_type="state", render_size=64) is not soft_env(PRESS, obs_type="state")
     played = play_episode(env, policy, 1, options={"youngs_modulus": 5.0e4}, max_steps=4)
     assert (policy.resets, policy.calls, len(played.steps)) == (1, 4, 4)
-    assert played.base.config.render_size == 64  # pyright: ignore[reportAttributeAccessIssue]
+    assert played.base.config.render_size == 64
     assert played.steps[-1].info["parameters"]["youngs_modulus"] == pytest.approx(5.0e4)
     with pytest.raises(ConfigError, match=r"unexpected keyword argument 'forse_tolerance'.*Nearest: force_tolerance"):
         soft_env(PRESS, forse_tolerance=0.2)

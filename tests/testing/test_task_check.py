@@ -19,7 +19,7 @@ from softmode.testing import check_task
 def write_secret(secret: wp.array[float], column: int, observation: wp.array2d[float]):
     """Write a number of each world to a column."""
     w = wp.tid()
-    observation[w, column] = secret[w]  # pyright: ignore[reportIndexIssue]
+    observation[w, column] = secret[w]
 
 
 class Secretive(PressSoft):
