@@ -12,6 +12,7 @@ import warp as wp
 
 from softmode.deformables.contact.cell_kernels import (
     NEAR,
+    CellShape,
     Surface,
     cell_at,
     fade_of,
@@ -20,6 +21,7 @@ from softmode.deformables.contact.cell_kernels import (
     touched_share,
     write_row,
 )
+from softmode.deformables.contact.crease_kernels import REACH, Crease, crease_at
 from softmode.deformables.contact.penalty_kernels import (
     BULK_FACTOR,
     HARDENING_DEPTH,
@@ -31,6 +33,7 @@ from softmode.deformables.contact.penalty_kernels import (
     stiffness_per_area,
 )
 from softmode.deformables.contact.shape_query_kernels import (
+    BOX,
     CAPSULE,
     CYLINDER,
     HEIGHTFIELD,
@@ -314,6 +317,7 @@ def find_contacts(
     samples.gap[i, s, 1] = wp.float64(1.0e30)
     x = samples.position[i, s]
     row = instances.row_start[i] + s
+    side = instances.scale[i] * wp.sqrt(basis.row_area[row])
     stuck = stick_shape[instances.particle_start[i] + s]
     for c in range(candidate.shape[1]):
         if near[i, c] == 0 or (c < CULLED and (samples.near[i, s] >> c) & 1 == 0):
@@ -363,6 +367,8 @@ def find_contacts(
             end = travel
         if end > 0.0:
             query = march(shapes, shape, local, query, along, end, back, thick, instances.smoothing[i], far)
+        if kind == BOX and edges_near(local, shapes.scale[shape] + wp.vec3(thick), side) >= 2:
+            reach = wp.max(reach, REACH * side)
         gap = wp.float64(query.distance)
         if gap < wp.float64(reach) and gap < samples.gap[i, s, 1]:
             normal = wp.quat_rotate(turn, query.normal)
@@ -442,6 +448,16 @@ def motion_of_cell(
 
 
 @wp.func
+def edges_near(x: wp.vec3, half: wp.vec3, distance: float):
+    """Return how many faces of a box a point is outside of, or less than a distance [m] inside."""
+    count = int(0)
+    for k in range(3):
+        if wp.abs(x[k]) > half[k] - distance:
+            count += 1
+    return count
+
+
+@wp.func
 def shape_frame(shapes: Shapes, shape: int):
     """Return origin and rotation of a shape at the start of the step, in float64."""
     pose = shapes.transform[shape]
@@ -449,6 +465,32 @@ def shape_frame(shapes: Shapes, shape: int):
     if body >= 0:
         pose = shapes.body_q[body] * pose
     return wp.vec3d(wp.transform_get_translation(pose)), wp.normalize(wp.quatd(wp.transform_get_rotation(pose)))
+
+
+@wp.func
+def crease_of(
+    instances: Instances,
+    basis: Basis,
+    motion: Motion,
+    shapes: Shapes,
+    cell: CellShape,
+    i: int,
+    row: int,
+    shape: int,
+    place: wp.vec3d,
+    gap: wp.float64,
+):
+    """Return what a box presses of the cell of a sample at a place; see ``crease_kernels``."""
+    origin, rotation = shape_frame(shapes, shape)
+    x = wp.quat_rotate_inv(rotation, place - origin)
+    thick = shapes.margin[shape] + instances.contact_radius[i]
+    area = basis.row_area[row]
+    crease = Crease()
+    if edges_near(wp.vec3(x), shapes.scale[shape] + wp.vec3(thick), 4.0 * instances.scale[i] * wp.sqrt(area)) >= 2:
+        F = wp.transpose(wp.quat_to_matrix(rotation)) * gradient_of(instances, basis, motion.q_start, i, row)
+        crease = crease_at(shapes.scale[shape], x, F, cell, area, float(gap), thick)
+        crease.normal = wp.quat_rotate(rotation, crease.normal)
+    return crease
 
 
 @wp.func
@@ -590,7 +632,10 @@ def gather_contacts(
         ahead = wp.mat33d()
         closing = wp.float64(0.0)
         spared = float(1.0)
-        if gap <= NEAR * cell_shape.steepest:
+        crease = Crease()
+        if shapes.kind[shape] == BOX:
+            crease = crease_of(instances, basis, motion, shapes, cell_shape, i, row, shape, samples.position[i, s], gap)
+        if gap <= NEAR * cell_shape.steepest or crease.found == 1:
             start, ahead, closing = motion_of_cell(instances, basis, motion, shapes, samples, i, row, shape, normal, dt)
             fade = fade_of(cell_shape, ahead, normal)
             touched = touched_share(surface, samples.shape, samples.gap, cell_shape, fade, i, row, shape)
@@ -604,7 +649,13 @@ def gather_contacts(
         firm = relative * surface.slenderness[row]
         kappa = stiffness_per_area(instances, i, BULK_FACTOR, firm, partner_mass, partner_area, dt)
         stiffness = wp.float64(kappa * area)
-        compliance = wp.float64(spared * dent_compliance(instances, i, relative, surface.dent_length[row]) / area)
+        length = surface.dent_length[row]
+        if crease.found == 1:
+            length = wp.min(spared * length, float(crease.width))
+            spared = float(1.0)
+            area *= float(crease.firmness)
+            stiffness *= crease.firmness
+        compliance = wp.float64(spared * dent_compliance(instances, i, relative, length) / area)
         share = float(1.0)
         if partner_mass > 0.0:  # what is light beside the body turns faster than its cells, which lag by a step
             share = partner_mass / (partner_mass + float(instances.mass[i]))
@@ -612,6 +663,12 @@ def gather_contacts(
         ratio = stiffness * compliance * wp.float64(share * share)
         cell = cell_at(cell_shape, ahead, normal, gap, closing, ratio)
         turned = wp.dot(normal, (ahead - start) * cell.centre)
+        if crease.found == 1:
+            normal = crease.normal
+            cell.onset = crease.onset
+            cell.lead = wp.float64(0.0)
+            cell.centre = crease.centre
+            turned = gap + crease.penetration
         # both bodies feel the force at one point, not the shape at its own surface: a pair of forces on two
         # points would make angular momentum out of friction times penetration
         point = wp.vec3(samples.position[i, s] + start * cell.centre)
@@ -630,7 +687,7 @@ def gather_contacts(
         constraints.arm[i, e] = arm
         constraints.normal[i, e] = normal
         shear = stiffness_per_area(instances, i, SHEAR_FACTOR, relative, partner_mass, partner_area, dt)
-        edged = (SMOOTH >> shapes.kind[shape]) & 1 == 0
+        edged = crease.found == 0 and (SMOOTH >> shapes.kind[shape]) & 1 == 0
         slip, anchor = remembered_slip(
             shapes,
             shape,

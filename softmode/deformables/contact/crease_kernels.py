@@ -1,0 +1,153 @@
+"""Device code of cells that an edge or a corner of a box presses: the mean over the cell of what its faces press.
+
+A half-space stands for a shape in a contact. Where two faces of a box look at a cell, each at a part of it, none does.
+Along the outward normal of the cell, deformed, its gap with face k of normal n_k at a place y is
+
+    g_k = n_k . (y - p_k) / c_k,   c_k = -n_k . N'            N' the normal of the cell, p_k on the face,
+
+and with the box max_k g_k. Means over a grid of places, of v = max(-g, 0) and of where it is touched, give
+
+    force per stiffness  sum v n_k / c_k,   its direction n, its centre of pressure,
+    stiffness per area   sum (n . n_k / c_k)^2 where touched: a face that leans against a cell presses more than its gap
+                         along its own normal says.
+
+One contact has that force and that stiffness at the start of the step: it is written as the penalty of a penetration p
+with an onset e, both p / e and p^2 / (2 e) given. A narrow patch is no softer than it is wide, whatever the functions
+leave out: the dent is bounded by ``WIDE`` times the width of what a wedge of the slope of the faces has in the cell.
+"""
+
+import warp as wp
+
+from softmode.deformables.contact.cell_kernels import FACING, LATE, CellShape
+from softmode.deformables.contact.shape_query_kernels import query_box
+from softmode.deformables.model.declare import struct
+
+wp.set_module_options({"enable_backward": False})
+
+PLACES = wp.constant(8)
+"""Places of a cell along each side,"""
+ALONG = wp.constant(wp.float64(8.0))
+"""as a number."""
+WIDE = wp.constant(wp.float64(1.6))
+"""Largest dent under the pressure E / (1 - nu^2) over the width of a patch: 1.2 of a cone's, 1.4 of a wedge's."""
+REACH = wp.constant(0.75)
+"""Distance to a box over the side of a cell up to which an edge may lie in the cell."""
+
+
+@struct
+class Crease:
+    """What a box presses of a cell."""
+
+    found: int  # whether two faces of it look at the cell or what is around
+    normal: wp.vec3d  # against which it presses, in the frame of the box
+    centre: wp.vec3d  # centre of pressure from the sample, at rest [m]
+    penetration: wp.float64  # p [m]
+    onset: wp.float64  # e [m]
+    firmness: wp.float64  # stiffness over that of a face
+    width: wp.float64  # largest dent under the pressure E / (1 - nu^2), as the patch is wide [m]
+
+
+@wp.func
+def crease_at(half: wp.vec3, x: wp.vec3d, F: wp.mat33d, shape: CellShape, area: float, gap: float, thick: float):
+    """Return what a box presses of a cell; none where one face does, or the gap is not that of the nearest point.
+
+    Args:
+        half: Half extents of the box [m].
+        x: The sample in the frame of the box [m].
+        F: Deformation gradient of the body there, into that frame.
+        shape: The cell.
+        area: Its area at rest, at scale 1 [m^2].
+        gap: Gap of the sample [m].
+        thick: By how much the box is grown [m].
+    """
+    zero = wp.float64(0.0)
+    one = wp.float64(1.0)
+    part = wp.sqrt(wp.float64(area)) / ALONG
+    crease = Crease()
+    if wp.abs(query_box(wp.vec3(x), half).distance - thick - gap) > 1.0e-6:
+        return crease
+    across = wp.vec3d()
+    across[wp.argmin(wp.abs(shape.normal))] = one
+    first = wp.normalize(wp.cross(shape.normal, across))
+    second = wp.cross(shape.normal, first)
+    u = F * first
+    v = F * second
+    outward = wp.normalize(wp.cross(u, v))
+    side = wp.vec3d()
+    away = wp.vec3d()
+    facing = wp.vec3d()
+    best = int(-1)
+    for k in range(3):
+        side[k] = wp.where(x[k] < zero, -one, one)
+        away[k] = wp.abs(x[k]) - wp.float64(half[k] + thick)
+        facing[k] = -side[k] * outward[k]
+        if facing[k] > FACING and (best < 0 or away[k] * facing[best] > away[best] * facing[k]):
+            best = k
+    if best < 0:
+        return crease
+    for k in range(3):
+        if k != best and facing[k] > FACING:
+            behind = away[best] / facing[best] - away[k] / facing[k]
+            turn = wp.vec2d(u[k], v[k]) * side[k] / facing[k] - wp.vec2d(u[best], v[best]) * side[best] / facing[best]
+            if behind < wp.length(turn) * part * ALONG:
+                crease.found = 1
+    if crease.found == 0:
+        return crease
+    half_side = wp.float64(0.5) * (ALONG - one)
+    pressed = zero
+    sloping = zero
+    least = wp.float64(1.0e30)
+    touched = wp.vec3d()
+    pull = wp.vec3d()
+    centre = wp.vec3d()
+    for place in range(PLACES * PLACES):
+        a = part * (wp.float64(place % PLACES) - half_side)
+        b = part * (wp.float64(place / PLACES) - half_side)
+        top = int(best)
+        height = wp.float64(-1.0e30)
+        missed = bool(False)
+        for k in range(3):
+            d = away[k] + side[k] * (a * u[k] + b * v[k])
+            if facing[k] > FACING:
+                if d / facing[k] > height:
+                    height = d / facing[k]
+                    top = k
+            elif d > zero:
+                missed = bool(True)
+        if missed:
+            continue
+        if height < least:
+            least = height
+            crease.centre = a * first + b * second
+        slope = wp.length(wp.vec2d(u[top], v[top])) / facing[top]
+        eps = wp.sqrt(shape.least * shape.least + part * part * slope * slope)
+        p = wp.float64(0.5) * eps - LATE * shape.least - height
+        if p > zero:
+            share = wp.min(p / eps, one)
+            depth = wp.where(p < eps, wp.float64(0.5) * p * share, p - wp.float64(0.5) * eps)
+            pressed += depth
+            sloping += depth * slope
+            touched[top] += share
+            pull[top] += depth * side[top] / facing[top]
+            centre += depth * (a * first + b * second)
+    if pressed == zero:
+        crease.normal = -outward
+        crease.penetration = -least
+        crease.onset = wp.float64(0.5) * part * ALONG + shape.least
+        crease.firmness = one
+        crease.width = shape.width
+        return crease
+    places = ALONG * ALONG
+    crease.centre = centre / pressed
+    crease.normal = wp.normalize(pull)
+    stiff = zero
+    for k in range(3):
+        if touched[k] > zero:
+            stiff += touched[k] * crease.normal[k] * crease.normal[k] / (facing[k] * facing[k])
+    share = (touched[0] + touched[1] + touched[2]) / places
+    crease.firmness = stiff / (share * places)
+    force = wp.length(pull) / places / crease.firmness
+    crease.penetration = wp.float64(2.0) * force / share
+    crease.onset = crease.penetration / share
+    crease.width = WIDE * wp.float64(2.0) * crease.penetration * pressed / wp.max(sloping, wp.float64(1.0e-12))
+    return crease
