@@ -13,7 +13,7 @@ and with the box max_k g_k. Means over a grid of places, of v = max(-g, 0) and o
 
 One contact has that force and that stiffness at the start of the step: it is written as the penalty of a penetration p
 with an onset e, both p / e and p^2 / (2 e) given. A narrow patch is no softer than it is wide, whatever the functions
-leave out: the dent is bounded by ``WIDE`` times the width of what a wedge of the slope of the faces has in the cell.
+leave out: see ``narrow_dent``.
 """
 
 import warp as wp
@@ -28,8 +28,10 @@ PLACES = wp.constant(8)
 """Places of a cell along each side,"""
 ALONG = wp.constant(wp.float64(8.0))
 """as a number."""
-WIDE = wp.constant(wp.float64(1.6))
-"""Largest dent under the pressure E / (1 - nu^2) over the width of a patch: 1.2 of a cone's, 1.4 of a wedge's."""
+WIDE = wp.constant(wp.float64(1.1))
+"""Largest dent under the pressure E / (1 - nu^2) over the width b of a patch, besides"""
+SLENDER = wp.constant(wp.float64(0.5))
+"""how many times ln(w / b) as much, w the dent of a wide patch: a strip on a half plane gives by the logarithm."""
 REACH = wp.constant(0.75)
 """Distance to a box over the side of a cell up to which an edge may lie in the cell."""
 
@@ -44,7 +46,15 @@ class Crease:
     penetration: wp.float64  # p [m]
     onset: wp.float64  # e [m]
     firmness: wp.float64  # stiffness over that of a face
-    width: wp.float64  # largest dent under the pressure E / (1 - nu^2), as the patch is wide [m]
+    width: wp.float64  # of the patch, as a wedge of the slope of the faces has it, at scale 1 [m]
+
+
+@wp.func
+def narrow_dent(length: float, width: wp.float64):
+    """Return the dent at scale 1 under E / (1 - nu^2) of a patch of a width [m]; ``length`` [m]: that of a wide one."""
+    wide = wp.float64(length)
+    slender = wp.log(wp.max(wide / width, wp.float64(1.0)))
+    return float(wp.min(wide, WIDE * width * (wp.float64(1.0) + SLENDER * slender)))
 
 
 @wp.func
@@ -149,5 +159,5 @@ def crease_at(half: wp.vec3, x: wp.vec3d, F: wp.mat33d, shape: CellShape, area: 
     force = wp.length(pull) / places / crease.firmness
     crease.penetration = wp.float64(2.0) * force / share
     crease.onset = crease.penetration / share
-    crease.width = WIDE * wp.float64(2.0) * crease.penetration * pressed / wp.max(sloping, wp.float64(1.0e-12))
+    crease.width = wp.float64(2.0) * crease.penetration * pressed / wp.max(sloping, wp.float64(1.0e-12))
     return crease

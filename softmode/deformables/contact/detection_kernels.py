@@ -21,7 +21,7 @@ from softmode.deformables.contact.cell_kernels import (
     touched_share,
     write_row,
 )
-from softmode.deformables.contact.crease_kernels import REACH, Crease, crease_at
+from softmode.deformables.contact.crease_kernels import REACH, Crease, crease_at, narrow_dent
 from softmode.deformables.contact.penalty_kernels import (
     BULK_FACTOR,
     HARDENING_DEPTH,
@@ -473,19 +473,21 @@ def crease_of(
     basis: Basis,
     motion: Motion,
     shapes: Shapes,
+    samples: Samples,
     cell: CellShape,
     i: int,
     row: int,
     shape: int,
-    place: wp.vec3d,
     gap: wp.float64,
 ):
-    """Return what a box presses of the cell of a sample at a place; see ``crease_kernels``."""
+    """Return what the faces of a shape press of the cell of a sample, if it is a box; see ``crease_kernels``."""
+    crease = Crease()
+    if shapes.kind[shape] != BOX:
+        return crease
     origin, rotation = shape_frame(shapes, shape)
-    x = wp.quat_rotate_inv(rotation, place - origin)
+    x = wp.quat_rotate_inv(rotation, samples.position[i, row - instances.row_start[i]] - origin)
     thick = shapes.margin[shape] + instances.contact_radius[i]
     area = basis.row_area[row]
-    crease = Crease()
     if edges_near(wp.vec3(x), shapes.scale[shape] + wp.vec3(thick), 4.0 * instances.scale[i] * wp.sqrt(area)) >= 2:
         F = wp.transpose(wp.quat_to_matrix(rotation)) * gradient_of(instances, basis, motion.q_start, i, row)
         crease = crease_at(shapes.scale[shape], x, F, cell, area, float(gap), thick)
@@ -632,9 +634,7 @@ def gather_contacts(
         ahead = wp.mat33d()
         closing = wp.float64(0.0)
         spared = float(1.0)
-        crease = Crease()
-        if shapes.kind[shape] == BOX:
-            crease = crease_of(instances, basis, motion, shapes, cell_shape, i, row, shape, samples.position[i, s], gap)
+        crease = crease_of(instances, basis, motion, shapes, samples, cell_shape, i, row, shape, gap)
         if gap <= NEAR * cell_shape.steepest or crease.found == 1:
             start, ahead, closing = motion_of_cell(instances, basis, motion, shapes, samples, i, row, shape, normal, dt)
             fade = fade_of(cell_shape, ahead, normal)
@@ -651,7 +651,7 @@ def gather_contacts(
         stiffness = wp.float64(kappa * area)
         length = surface.dent_length[row]
         if crease.found == 1:
-            length = wp.min(spared * length, float(crease.width))
+            length = narrow_dent(spared * length, crease.width)
             spared = float(1.0)
             area *= float(crease.firmness)
             stiffness *= crease.firmness
