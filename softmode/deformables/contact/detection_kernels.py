@@ -11,6 +11,7 @@ contact records are appended by an atomic counter: fixed slots per sample keep t
 import warp as wp
 
 from softmode.deformables.contact.cell_kernels import (
+    FACING,
     NEAR,
     CellShape,
     Surface,
@@ -367,8 +368,12 @@ def find_contacts(
             end = travel
         if end > 0.0:
             query = march(shapes, shape, local, query, along, end, back, thick, instances.smoothing[i], far)
-        if kind == BOX and edges_near(local, shapes.scale[shape] + wp.vec3(thick), side) >= 2:
-            reach = wp.max(reach, REACH * side)
+        if kind == BOX and query.distance >= reach and query.distance < REACH * side:
+            if edges_near(local, shapes.scale[shape] + wp.vec3(thick), side):
+                F = gradient_of(instances, basis, motion.q_start, i, row)
+                outward = wp.quat_rotate_inv(turn, wp.vec3(F * wp.vec3d(basis.row_normal[row])))
+                if faces_seen(local, wp.normalize(outward)) >= 2:
+                    reach = REACH * side
         gap = wp.float64(query.distance)
         if gap < wp.float64(reach) and gap < samples.gap[i, s, 1]:
             normal = wp.quat_rotate(turn, query.normal)
@@ -449,10 +454,20 @@ def motion_of_cell(
 
 @wp.func
 def edges_near(x: wp.vec3, half: wp.vec3, distance: float):
-    """Return how many faces of a box a point is outside of, or less than a distance [m] inside."""
+    """Return whether a point is outside of two faces of a box, or less than a distance [m] inside."""
     count = int(0)
     for k in range(3):
         if wp.abs(x[k]) > half[k] - distance:
+            count += 1
+    return count >= 2
+
+
+@wp.func
+def faces_seen(x: wp.vec3, outward: wp.vec3):
+    """Return how many faces of a box at the origin a surface at x looks at."""
+    count = int(0)
+    for k in range(3):
+        if -wp.sign(x[k]) * outward[k] > float(FACING):
             count += 1
     return count
 
@@ -488,7 +503,7 @@ def crease_of(
     x = wp.quat_rotate_inv(rotation, samples.position[i, row - instances.row_start[i]] - origin)
     thick = shapes.margin[shape] + instances.contact_radius[i]
     area = basis.row_area[row]
-    if edges_near(wp.vec3(x), shapes.scale[shape] + wp.vec3(thick), 4.0 * instances.scale[i] * wp.sqrt(area)) >= 2:
+    if edges_near(wp.vec3(x), shapes.scale[shape] + wp.vec3(thick), 4.0 * instances.scale[i] * wp.sqrt(area)):
         F = wp.transpose(wp.quat_to_matrix(rotation)) * gradient_of(instances, basis, motion.q_start, i, row)
         crease = crease_at(shapes.scale[shape], x, F, cell, area, float(gap), thick)
         crease.normal = wp.quat_rotate(rotation, crease.normal)
