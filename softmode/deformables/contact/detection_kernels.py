@@ -11,7 +11,6 @@ contact records are appended by an atomic counter: fixed slots per sample keep t
 import warp as wp
 
 from softmode.deformables.contact.cell_kernels import (
-    FACING,
     NEAR,
     CellShape,
     Surface,
@@ -22,7 +21,7 @@ from softmode.deformables.contact.cell_kernels import (
     touched_share,
     write_row,
 )
-from softmode.deformables.contact.crease_kernels import REACH, Crease, crease_at, narrow_dent
+from softmode.deformables.contact.crease_kernels import REACH, Crease, crease_at, narrow_dent, near_edge
 from softmode.deformables.contact.penalty_kernels import (
     BULK_FACTOR,
     HARDENING_DEPTH,
@@ -369,11 +368,9 @@ def find_contacts(
         if end > 0.0:
             query = march(shapes, shape, local, query, along, end, back, thick, instances.smoothing[i], far)
         if kind == BOX and query.distance >= reach and query.distance < REACH * side:
-            if edges_near(local, shapes.scale[shape] + wp.vec3(thick), side):
-                F = gradient_of(instances, basis, motion.q_start, i, row)
-                outward = wp.quat_rotate_inv(turn, wp.vec3(F * wp.vec3d(basis.row_normal[row])))
-                if faces_seen(local, wp.normalize(outward)) >= 2:
-                    reach = REACH * side
+            F = gradient_of(instances, basis, motion.q_start, i, row)
+            outward = wp.quat_rotate_inv(turn, wp.vec3(F * wp.vec3d(basis.row_normal[row])))
+            reach = wp.where(near_edge(local, shapes.scale[shape], outward, side), REACH * side, reach)
         gap = wp.float64(query.distance)
         if gap < wp.float64(reach) and gap < samples.gap[i, s, 1]:
             normal = wp.quat_rotate(turn, query.normal)
@@ -453,26 +450,6 @@ def motion_of_cell(
 
 
 @wp.func
-def edges_near(x: wp.vec3, half: wp.vec3, distance: float):
-    """Return whether a point is outside of two faces of a box, or less than a distance [m] inside."""
-    count = int(0)
-    for k in range(3):
-        if wp.abs(x[k]) > half[k] - distance:
-            count += 1
-    return count >= 2
-
-
-@wp.func
-def faces_seen(x: wp.vec3, outward: wp.vec3):
-    """Return how many faces of a box at the origin a surface at x looks at."""
-    count = int(0)
-    for k in range(3):
-        if -wp.sign(x[k]) * outward[k] > float(FACING):
-            count += 1
-    return count
-
-
-@wp.func
 def shape_frame(shapes: Shapes, shape: int):
     """Return origin and rotation of a shape at the start of the step, in float64."""
     pose = shapes.transform[shape]
@@ -486,10 +463,10 @@ def shape_frame(shapes: Shapes, shape: int):
 def crease_of(
     instances: Instances,
     basis: Basis,
-    motion: Motion,
     shapes: Shapes,
     samples: Samples,
     cell: CellShape,
+    F: wp.mat33d,
     i: int,
     row: int,
     shape: int,
@@ -497,15 +474,12 @@ def crease_of(
 ):
     """Return what the faces of a shape press of the cell of a sample, if it is a box; see ``crease_kernels``."""
     crease = Crease()
-    if shapes.kind[shape] != BOX:
-        return crease
-    origin, rotation = shape_frame(shapes, shape)
-    x = wp.quat_rotate_inv(rotation, samples.position[i, row - instances.row_start[i]] - origin)
-    thick = shapes.margin[shape] + instances.contact_radius[i]
-    area = basis.row_area[row]
-    if edges_near(wp.vec3(x), shapes.scale[shape] + wp.vec3(thick), 4.0 * instances.scale[i] * wp.sqrt(area)):
-        F = wp.transpose(wp.quat_to_matrix(rotation)) * gradient_of(instances, basis, motion.q_start, i, row)
-        crease = crease_at(shapes.scale[shape], x, F, cell, area, float(gap), thick)
+    if shapes.kind[shape] == BOX:
+        origin, rotation = shape_frame(shapes, shape)
+        x = wp.quat_rotate_inv(rotation, samples.position[i, row - instances.row_start[i]] - origin)
+        grown = shapes.margin[shape] + instances.contact_radius[i]
+        local = wp.transpose(wp.quat_to_matrix(rotation)) * F
+        crease = crease_at(shapes.scale[shape], x, local, cell, basis.row_area[row], float(gap), grown)
         crease.normal = wp.quat_rotate(rotation, crease.normal)
     return crease
 
@@ -649,9 +623,12 @@ def gather_contacts(
         ahead = wp.mat33d()
         closing = wp.float64(0.0)
         spared = float(1.0)
-        crease = crease_of(instances, basis, motion, shapes, samples, cell_shape, i, row, shape, gap)
-        if gap <= NEAR * cell_shape.steepest or crease.found == 1:
+        crease = Crease()
+        close = gap <= NEAR * cell_shape.steepest
+        if close or shapes.kind[shape] == BOX:
             start, ahead, closing = motion_of_cell(instances, basis, motion, shapes, samples, i, row, shape, normal, dt)
+            crease = crease_of(instances, basis, shapes, samples, cell_shape, start, i, row, shape, gap)
+        if close or crease.found == 1:
             fade = fade_of(cell_shape, ahead, normal)
             touched = touched_share(surface, samples.shape, samples.gap, cell_shape, fade, i, row, shape)
             spared = float(wp.float64(1.0) - touched * touched)
