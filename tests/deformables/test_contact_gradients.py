@@ -260,7 +260,7 @@ def test_frozen_normal_force_is_named() -> None:
 
 
 def test_a_normal_that_turns_is_refused() -> None:
-    """On a sphere and an edge the normal turns: refused, unless it is taken for fixed. On the face of a box it does not.
+    """On a sphere or an edge the normal turns: refused unless it is taken for fixed. On the face of a box it does not.
 
     What the edge of a box presses of a cell is restored as it was: the recorded step is at its root.
     """

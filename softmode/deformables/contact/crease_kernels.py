@@ -25,7 +25,9 @@ from softmode.deformables.model.declare import struct
 wp.set_module_options({"enable_backward": False})
 
 PLACES = wp.constant(8)
-"""Places of a cell along each side."""
+"""Places of a cell along each side,"""
+NUMBER = wp.constant(wp.float64(8.0))
+"""as a number."""
 WIDE = wp.constant(wp.float64(1.1))
 """Largest dent under the pressure E / (1 - nu^2) over the width b of a patch, besides"""
 SLENDER = wp.constant(wp.float64(0.5))
@@ -99,8 +101,7 @@ def crease_at(half: wp.vec3, x: wp.vec3d, F: wp.mat33d, shape: CellShape, area: 
     zero = wp.float64(0.0)
     one = wp.float64(1.0)
     two = wp.float64(2.0)
-    count = wp.float64(PLACES)
-    part = wp.sqrt(wp.float64(area)) / count
+    part = wp.sqrt(wp.float64(area)) / NUMBER
     across = wp.vec3d()
     across[wp.argmin(wp.abs(shape.normal))] = one
     first = part * wp.normalize(wp.cross(shape.normal, across))
@@ -122,7 +123,7 @@ def crease_at(half: wp.vec3, x: wp.vec3d, F: wp.mat33d, shape: CellShape, area: 
     for k in range(3):
         if best >= 0 and k != best and facing[k] > FACING:
             turn = wp.vec2d(u[k], v[k]) * side[k] / facing[k] - wp.vec2d(u[best], v[best]) * side[best] / facing[best]
-            if away[best] / facing[best] - away[k] / facing[k] < wp.length(turn) * count:
+            if away[best] / facing[best] - away[k] / facing[k] < wp.length(turn) * NUMBER:
                 crease.found = 1
     if crease.found == 0 or wp.abs(query_box(wp.vec3(x), half).distance - grown - gap) > 1.0e-6:
         return Crease()
@@ -134,8 +135,8 @@ def crease_at(half: wp.vec3, x: wp.vec3d, F: wp.mat33d, shape: CellShape, area: 
     pull = wp.vec3d()
     centre = wp.vec3d()
     for place in range(PLACES * PLACES):
-        a = wp.float64(place % PLACES) + (one - count) / two
-        b = wp.float64(place / PLACES) + (one - count) / two
+        a = wp.float64(place % PLACES) + (one - NUMBER) / two
+        b = wp.float64(place / PLACES) + (one - NUMBER) / two
         far, _top = face_over(away, side, facing, u, v, AROUND * a, AROUND * b)
         deepest = wp.min(deepest, far)
         height, top = face_over(away, side, facing, u, v, a, b)
@@ -157,7 +158,7 @@ def crease_at(half: wp.vec3, x: wp.vec3d, F: wp.mat33d, shape: CellShape, area: 
     if pressed == zero:
         crease.normal = -outward
         crease.penetration = -least
-        crease.onset = part * count / two + shape.least
+        crease.onset = part * NUMBER / two + shape.least
         crease.firmness = one
         crease.width = shape.width
         return crease
@@ -167,9 +168,9 @@ def crease_at(half: wp.vec3, x: wp.vec3d, F: wp.mat33d, shape: CellShape, area: 
     for k in range(3):
         if touched[k] > zero:
             stiff += touched[k] * crease.normal[k] * crease.normal[k] / (facing[k] * facing[k])
-    share = (touched[0] + touched[1] + touched[2]) / (count * count)
-    crease.firmness = stiff / (share * count * count)
-    crease.penetration = two * wp.length(pull) / (count * count * crease.firmness * share)
+    share = (touched[0] + touched[1] + touched[2]) / (NUMBER * NUMBER)
+    crease.firmness = stiff / (share * NUMBER * NUMBER)
+    crease.penetration = two * wp.length(pull) / (NUMBER * NUMBER * crease.firmness * share)
     crease.onset = crease.penetration / share
     crease.width = two * wp.max(crease.penetration, -deepest) * pressed * part / wp.max(sloping, wp.float64(1.0e-12))
     return crease

@@ -44,6 +44,7 @@ from softmode.deformables.contact.shape_query_kernels import (
     SurfaceQuery,
     query_heightfield,
     query_shape,
+    signs,
 )
 from softmode.deformables.model.declare import struct
 from softmode.deformables.model.deformation_kernels import displacement_gradient
@@ -368,9 +369,10 @@ def find_contacts(
         if end > 0.0:
             query = march(shapes, shape, local, query, along, end, back, thick, instances.smoothing[i], far)
         if kind == BOX and query.distance >= reach and query.distance < REACH * side:
-            F = gradient_of(instances, basis, motion.q_start, i, row)
-            outward = wp.quat_rotate_inv(turn, wp.vec3(F * wp.vec3d(basis.row_normal[row])))
-            reach = wp.where(near_edge(local, shapes.scale[shape], outward, side), REACH * side, reach)
+            if near_edge(local, shapes.scale[shape], -signs(local), side):
+                F = gradient_of(instances, basis, motion.q_start, i, row)
+                outward = wp.quat_rotate_inv(turn, wp.vec3(F * wp.vec3d(basis.row_normal[row])))
+                reach = wp.where(near_edge(local, shapes.scale[shape], outward, side), REACH * side, reach)
         gap = wp.float64(query.distance)
         if gap < wp.float64(reach) and gap < samples.gap[i, s, 1]:
             normal = wp.quat_rotate(turn, query.normal)
@@ -623,16 +625,22 @@ def gather_contacts(
         ahead = wp.mat33d()
         closing = wp.float64(0.0)
         spared = float(1.0)
+        area = wp.max(sample_area(instances.scale[i], basis.row_area[row]), 1.0e-30)
         crease = Crease()
         close = gap <= NEAR * cell_shape.steepest
-        if close or shapes.kind[shape] == BOX:
+        beside = shapes.kind[shape] == BOX
+        if beside:
+            origin, rotation = shape_frame(shapes, shape)
+            x = wp.vec3(wp.quat_rotate_inv(rotation, samples.position[i, s] - origin))
+            beside = near_edge(x, shapes.scale[shape], -signs(x), 6.0 * wp.sqrt(area))
+        if close or beside:
             start, ahead, closing = motion_of_cell(instances, basis, motion, shapes, samples, i, row, shape, normal, dt)
+        if beside:
             crease = crease_of(instances, basis, shapes, samples, cell_shape, start, i, row, shape, gap)
         if close or crease.found == 1:
             fade = fade_of(cell_shape, ahead, normal)
             touched = touched_share(surface, samples.shape, samples.gap, cell_shape, fade, i, row, shape)
             spared = float(wp.float64(1.0) - touched * touched)
-        area = wp.max(sample_area(instances.scale[i], basis.row_area[row]), 1.0e-30)
         relative = surface.relative_stiffness[row]
         partner_mass = float(0.0)
         if shapes.body[shape] >= 0 and prescribed == 0:
