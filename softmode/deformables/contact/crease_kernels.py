@@ -28,10 +28,9 @@ PLACES = wp.constant(8)
 """Places of a cell along each side,"""
 NUMBER = wp.constant(wp.float64(8.0))
 """as a number."""
-WIDE = wp.constant(wp.float64(1.1))
-"""Largest dent under the pressure E / (1 - nu^2) over the width b of a patch, besides"""
 SLENDER = wp.constant(wp.float64(0.5))
-"""how many times ln(w / b) as much, w the dent of a wide patch: a strip on a half plane gives by the logarithm."""
+"""By how many times ln(w / b) a patch of the width b dents more than b under the pressure E / (1 - nu^2), w the dent of
+a wide patch: a strip on a half plane gives by the logarithm."""
 AROUND = wp.constant(wp.float64(3.0))
 """Side of what is looked at of a patch to know how wide it is, in cells."""
 REACH = wp.constant(0.75)
@@ -66,7 +65,7 @@ def narrow_dent(length: float, width: wp.float64):
     """Return the dent at scale 1 under E / (1 - nu^2) of a patch of a width [m]; ``length`` [m]: that of a wide one."""
     wide = wp.float64(length)
     slender = wp.log(wp.max(wide / width, wp.float64(1.0)))
-    return float(wp.min(wide, WIDE * width * (wp.float64(1.0) + SLENDER * slender)))
+    return float(wp.min(wide, width * (wp.float64(1.0) + SLENDER * slender)))
 
 
 @wp.func
