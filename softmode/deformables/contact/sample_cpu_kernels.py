@@ -96,7 +96,7 @@ def _cull_snippet() -> str:
     const double* position = (const double*)samples.position.data + 3 * first;
     const float* drift = (const float*)samples.drift.data + 3 * first;
     const double* inner = (const double*)basis.inner_point.data + 3 * (size_t)instances.row_start.data[i];
-    const double scale = instances.scale.data[i], margin = instances.margin.data[i], edge = REACH * scale;
+    const double scale = instances.scale.data[i], margin = instances.margin.data[i];
     const float* area = basis.row_area.data + instances.row_start.data[i];
     const int* memory = (const int*)stick_shape.data + 2 * (size_t)instances.particle_start.data[i];
     const bool fresh = dt_before.data[i] == 0.0;
@@ -115,11 +115,12 @@ def _cull_snippet() -> str:
             }
         }
         depth = 2.0 * scale * __builtin_elementwise_sqrt(depth);
-        wide = edge * __builtin_elementwise_sqrt(wide);
+        wide = scale * __builtin_elementwise_sqrt(wide);
         words bits = (words)(long long)passed;
         for (int n = 0; n < frame_count; ++n) {
             const Frame& f = frames[n];
             lanes gap = 0.0, travel = 0.0, arm[3], from[3];
+            words beside = 0;
             for (int k = 0; k < 3; ++k) {
                 arm[k] = x[k] - f.centre[k];
                 from[k] = x[k] - f.origin[k];
@@ -127,6 +128,7 @@ def _cull_snippet() -> str:
             for (int k = 0; k < 3; ++k) {
                 const lanes local = f.turn[k] * from[0] + f.turn[3 + k] * from[1] + f.turn[6 + k] * from[2];
                 lanes away = local - f.upper[k] > f.lower[k] - local ? local - f.upper[k] : f.lower[k] - local;
+                beside -= away > -wide - f.slack;
                 away = away > 0.0 ? away : (lanes)0.0;
                 gap += away * away;
                 const int l = (k + 1) % 3, m = (k + 2) % 3;
@@ -134,7 +136,7 @@ def _cull_snippet() -> str:
                 travel += (move[k] - moving) * (move[k] - moving);
             }
             lanes reach = margin + 2.0 * __builtin_elementwise_sqrt(travel);
-            reach = wide > reach ? wide : reach;
+            reach = ((beside > 1) & (REACH * wide > reach)) ? REACH * wide : reach;
             const words shape = (words)(long long)f.shape, bit = (words)(long long)f.bit;
             const words touched = (stuck[0] == shape) | (stuck[1] == shape) | (fresh ? ~(words)0 : (words)0);
             const lanes within = ((touched & (depth > reach)) ? depth : reach) + f.thick + f.slack;
