@@ -1,8 +1,8 @@
-"""References for contact by finite elements: a sphere between rigid plates, and a rigid wedge pressed into a cube.
+"""References for contact by finite elements: a sphere between rigid plates.
 
-Run: ``python -m benchmarks.hertz_elements``. Own elements (axisymmetric quadrilaterals, hexahedra), the energy of
-softmode's default material written from its closed form, frictionless contact by a penalty a thousand times as stiff.
-Prints force over Hertz's of the sphere, and force over E edge^2 of the wedge, on two meshes each.
+Run: ``python -m benchmarks.hertz_elements``. Own elements (axisymmetric quadrilaterals), the energy of softmode's
+default material written from its closed form, frictionless contact by a penalty a thousand times as stiff. Prints force
+over Hertz's on two meshes. Edges and corners: `edge_elements`.
 """
 
 from __future__ import annotations
@@ -32,10 +32,6 @@ def main() -> None:
             forces = press(*sphere(*counts), depths, ratio)
             row = [f / (4.0 / 3.0 / (1.0 - ratio**2) * d**1.5) for f, d in zip(forces, depths, strict=True)]
             print(f"nu {ratio}, {counts[0] * counts[1]} elements:", *(f"{value:.3f}" for value in row), flush=True)
-    depths = (0.01, 0.03, 0.05)
-    print("wedge of 90 degrees across a cube, nu 0.3, force over E edge^2 at d / edge of", *depths)
-    for counts in ((10, 4, 10), (16, 5, 14)):
-        print(*counts, "elements of a quarter:", *(f"{4.0 * f:.5f}" for f in press(*wedge(*counts), depths, 0.3)))
 
 
 def graded(count: int, share: float) -> Array:
@@ -65,23 +61,6 @@ def sphere(around: int, out: int) -> tuple[Array, Array, Array, Ints, Mask, Arra
     unused = np.setdiff1d(np.arange(len(x)), corners)
     held[unused] = True
     return matrix, 2.0 * np.pi * r * weight, x, corners, held, np.stack([top, area])
-
-
-def wedge(across: int, along: int, deep: int) -> tuple[Array, Array, Array, Ints, Mask, Array]:
-    """Return the same of a quarter of a cube of edge 1, finer where the edge of the wedge, along Y, presses."""
-    lines = (0.5 * graded(across, 0.9), 0.5 * graded(along, 0.0), 1.0 - graded(deep, 0.9)[::-1])
-    x = np.stack(np.meshgrid(*lines, indexing="ij"), -1).reshape(-1, 3)
-    index = np.arange(len(x)).reshape(across + 1, along + 1, deep + 1)
-    n = (across, along, deep)
-    parts = [(a, b, c) for a in (0, 1) for b in (0, 1) for c in (0, 1)]
-    corners = np.stack([index[a : n[0] + a, b : n[1] + b, c : n[2] + c].ravel() for a, b, c in parts], -1)
-    gradient, weight, _values = integrate(x, corners)
-    matrix = np.zeros((len(weight), 9, 24))
-    for i in range(3):
-        for j in range(3):
-            matrix[:, 3 * i + j, i::3] = gradient[:, :, j]
-    area = np.outer(*(np.convolve(np.diff(line), [0.5, 0.5]) for line in lines[:2])).ravel()
-    return matrix, weight, x, corners, x < 1.0e-9, np.stack([index[:, :, -1].ravel(), area])
 
 
 def integrate(x: Array, corners: Ints) -> tuple[Array, Array, Array]:
@@ -123,13 +102,12 @@ def press(
     depths: tuple[float, ...],
     ratio: float,
 ) -> list[float]:
-    """Press a plate (in two dimensions) or a wedge into the top and return its forces [E R^2] at some depths."""
-    dim, top, stiffness = x.shape[1], surface[0].astype(int), 1.0e3 * surface[1]
-    outward = np.array([0.0, 1.0]) if dim == 2 else np.array([-1.0, 0.0, 1.0]) / np.sqrt(2.0)
-    dofs = np.tile((dim * corners[:, :, None] + np.arange(dim)).reshape(len(corners), -1), (2**dim, 1))
+    """Press a plate onto the top and return its forces [E R^2] at some depths."""
+    top, stiffness = surface[0].astype(int), 1.0e3 * surface[1]
+    dofs = np.tile((2 * corners[:, :, None] + np.arange(2)).reshape(len(corners), -1), (4, 1))
     rows, columns = np.repeat(dofs, dofs.shape[1], axis=1).ravel(), np.tile(dofs, (1, dofs.shape[1])).ravel()
     u, free, forces = np.zeros(x.size), np.flatnonzero(~held.ravel()), []
-    at = dim * top[:, None] + np.arange(dim)
+    at = 2 * top + 1
     for depth in depths:
         force = 0.0
         for _ in range(60):
@@ -138,16 +116,13 @@ def press(
             gradient = np.bincount(dofs.ravel(), np.einsum("eij,ei,e->ej", matrix, P, weight).ravel(), x.size)
             blocks = matrix.swapaxes(1, 2) @ (tangent * weight[:, None, None]) @ matrix
             H = sparse.csr_matrix((blocks.ravel(), (rows, columns)), (x.size, x.size))
-            gap = (x[top] + u.reshape(x.shape)[top]) @ outward - outward[-1] * (1.0 - depth)
+            gap = x[top, 1] + u[at] - (1.0 - depth)
             touching = stiffness * (gap > 0.0)
-            gradient += np.bincount(at.ravel(), np.outer(touching * gap, outward).ravel(), x.size)
-            for i in range(dim):
-                for j in range(dim):
-                    entries = touching * outward[i] * outward[j]
-                    H += sparse.csr_matrix((entries, (at[:, i], at[:, j])), H.shape)
+            gradient += np.bincount(at, touching * gap, x.size)
+            H += sparse.csr_matrix((touching, (at, at)), H.shape)
             move = np.zeros(x.size)
             move[free] = -linalg.spsolve(H[free][:, free].tocsc(), gradient[free])
-            force = float((touching * gap).sum() * outward[-1])
+            force = float((touching * gap).sum())
             most = np.abs(move).max()
             u += min(1.0, 0.02 / most) * move
             if most < 1.0e-8:

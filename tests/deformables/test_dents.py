@@ -86,7 +86,7 @@ class Press:
             for _ in range(2):
                 shape = world.add_body(is_kinematic=True)
                 if punch is None:
-                    world.add_shape_box(shape, hx=0.1, hy=0.1, hz=SHAPE)
+                    world.add_shape_box(shape, hx=0.15, hy=0.15, hz=SHAPE)
                 else:
                     world.add_shape_cylinder(shape, radius=punch, half_height=SHAPE)
 
