@@ -95,7 +95,9 @@ def test_a_block_that_was_pressed_stays_pressed() -> None:
     )
     builder = newton.ModelBuilder()
     for side in (-1.0, 1.0):
-        at = builder.add_body(xform=wp.transform(wp.vec3(0.0, 0.0, side * (half + 0.5001 * dx + 0.04)), wp.quat_identity()))
+        at = builder.add_body(
+            xform=wp.transform(wp.vec3(0.0, 0.0, side * (half + 0.5001 * dx + 0.04)), wp.quat_identity())
+        )
         builder.add_shape_box(at, hx=0.1, hy=0.1, hz=0.04)
     model = builder.finalize(device="cpu")
     state = model.state()
@@ -109,7 +111,11 @@ def test_a_block_that_was_pressed_stays_pressed() -> None:
     s.forward()
     s.check()
     x = s.last.x.numpy()[0]
-    print(np.ptp(x, axis=0), s.impulse.numpy()[-50:, 0, :, 2].mean(0) / options.dt, np.linalg.det(s.last.F.numpy()[0]).mean())
+    print(
+        np.ptp(x, axis=0),
+        s.impulse.numpy()[-50:, 0, :, 2].mean(0) / options.dt,
+        np.linalg.det(s.last.F.numpy()[0]).mean(),
+    )
     area = (np.ptp(x[:, 0]) + dx / 2) * (np.ptp(x[:, 1]) + dx / 2)
     print("stress", s.impulse.numpy()[-50:, 0, :, 2].mean(0) / options.dt / area)
     f = s.impulse.numpy()[:, 0, 1, 2] / options.dt
