@@ -109,9 +109,7 @@ class Kitchen:
 def test_final(kitchen: Kitchen) -> None:
     """The print is as deep as that of the fine run to 5 %, the waist stays, and nothing left the grid."""
     depth, waist = kitchen.shape()
-    print(
-        f"the print is {1e3 * depth:.2f} mm deep, {1e3 * FINE:.2f} mm with fine cells; the waist is {1e3 * waist:.1f} mm"
-    )
+    print(f"print {1e3 * depth:.2f} mm deep, {1e3 * FINE:.2f} mm with fine cells; waist {1e3 * waist:.1f} mm wide")
     assert abs(depth / FINE - 1.0) < 0.05
     assert waist < 0.7 * SIZE[1]
 

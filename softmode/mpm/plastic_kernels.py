@@ -1,9 +1,9 @@
 """Device side of plasticity: the return of a deformation gradient to von Mises' yield surface, and its adjoint.
 
 F = U diag(exp e) V^T holds what is elastic. It yields where |dev tau| > sqrt(2/3) times the yield stress, with tau the
-Kirchhoff stress of any energy. What flows is taken from the deviator of the logarithmic strain: e' = mean(e) + s dev(e),
-so that det F stays, with s the share at which |dev tau(e')| is at the limit (Simo 1992, doi:10.1016/0045-7825(92)90123-2;
-where tau is linear in e, s = limit / |dev tau|, the radial return).
+Kirchhoff stress of any energy. What flows leaves the deviator of the logarithmic strain, e' = mean(e) + s dev(e), so
+that det F stays; s in (0, 1) is the share at which |dev tau(e')| is at the limit (Simo 1992, doi:10.1016/0045-7825(92)
+90123-2; where tau is linear in e, s = limit / |dev tau|, the radial return).
 """
 
 from typing import Any
@@ -148,8 +148,8 @@ def return_to_yield_adjoint(
 ):
     """Adjoint of :func:`return_to_yield`.
 
-    In the frame of U and V, dF'_ij +- dF'_ji = (g_i -+ g_j) / (sigma_i -+ sigma_j) (dF_ij +- dF_ji), with sigma and g the
-    stretches before and after. On the diagonal e' = mean(e) + s dev(e), and ds follows from |dev tau(e')| = limit.
+    In the frame of U and V, dF'_ij +- dF'_ji = (g_i -+ g_j) / (s_i -+ s_j) (dF_ij +- dF_ji), with s and g the stretches
+    before and after. On the diagonal e' = mean(e) + s dev(e), and ds follows from |dev tau(e')| = limit.
     """
     world, p = wp.tid()
     if not mass[world, p] > type(dt)(0.0):

@@ -432,12 +432,9 @@ class MpmSimulation:
                 count = self.bodies[world].count
                 out = count - int(self.options.grid.holds(self.last.x.numpy()[world, :count]).sum())
                 told = f"; {out} of {count} are outside, where they stand still and weigh nothing"
-                hint = (
-                    "take a larger grid (Grid.around(..., room=)), or more damping, a weaker control or slower shapes"
-                )
-            raise SolverDiverged(
-                f"world {world}, step {step}: particle {particle} {REASONS[int(kind)]}{told}", hint=hint
-            )
+                hint = "take a larger grid (Grid.around(..., room=)), more damping, a weaker control or slower shapes"
+            what = f"particle {particle} {REASONS[int(kind)]}{told}"
+            raise SolverDiverged(f"world {world}, step {step}: {what}", hint=hint)
 
     def wrenches(self) -> Array:
         """Return the mean wrench of the last run on each shape of the model [N] and [N m], shape (W, shapes, 6)."""

@@ -23,10 +23,10 @@ class SolverCoupledParticles(SolverBase):
     3. what they gave to the shapes joins ``state.body_f`` as a mean wrench, as the push of reduced bodies does;
     4. the solver takes its step: the joint solve of ``SolverCoupledReduced`` sees it, with all constraints.
 
-    Momentum that particles lose in a step, bodies get in the same. What is late by a step is the velocity that particles
-    meet: the bodies do not yield within it. This is stable while what touches a shape, particles within it and the
-    stiffness of what lies behind times dt^2, is lighter than the body is to a push: M + dt (D + K_d), as in the joint
-    solve. Nothing is read back; a step may be captured with ``wp.ScopedCapture`` on CPU and CUDA.
+    Momentum that particles lose in a step, bodies get in the same. Late by a step is the velocity that particles
+    meet: bodies do not give way within it. This is stable while what touches a shape (particles at its nodes, and the
+    stiffness of what lies behind times dt^2) is lighter than the body is to a push, which is M + dt (D + K_d) as in the
+    joint solve. Nothing is read back; a step may be captured with ``wp.ScopedCapture`` on CPU and CUDA.
 
     Args:
         solver: What moves the bodies: ``SolverMuJoCo``, :class:`softmode.deformables.SolverCoupledReduced`.
