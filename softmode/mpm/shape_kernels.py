@@ -25,7 +25,6 @@ class Obstacles:
     index: wp.array[int]  # (S,), of the shape in the model
     world: wp.array[int]  # (S,), -1 for all worlds
     boundary: wp.array[int]  # (S,): STICK, SLIP, or else separate
-    inset: float  # how deep in a shape a node lies free [m]
 
 
 @struct
@@ -65,7 +64,7 @@ def touch(obstacles: Obstacles, s: int, world: int, x: wp.vec3, time: float):
         pose = place * pose
     local = wp.transform_point(wp.transform_inverse(pose), before)
     kind = obstacles.shapes.kind[shape]
-    margin = obstacles.shapes.margin[shape] - obstacles.inset
+    margin = obstacles.shapes.margin[shape]
     lower = obstacles.shapes.lower[shape]
     upper = obstacles.shapes.upper[shape]
     if kind != PLANE and kind != HEIGHTFIELD:

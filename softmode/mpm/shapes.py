@@ -9,7 +9,7 @@ import newton
 import numpy as np
 import warp as wp
 
-from softmode.checks import require_choice, require_number
+from softmode.checks import require_choice
 from softmode.deformables.contact.shape_query_kernels import HEIGHTFIELD, PLANE
 from softmode.deformables.contact.shape_tables import shape_table, solid_shapes
 from softmode.deformables.model.tables import host
@@ -37,7 +37,6 @@ class GridShapes:
         model: newton.Model,
         *,
         boundary: Boundary | Sequence[Boundary] = "separate",
-        inset: float = 0.0,
         state: newton.State | None = None,
     ) -> None:
         """Read the shapes of a model.
@@ -45,13 +44,10 @@ class GridShapes:
         Args:
             model: The model; closed meshes, heightfields and primitives.
             boundary: What shapes do to nodes, one word for all or one for each shape of the model.
-            inset: How deep in a shape, or in its margin, nodes are free [m]. Particles stop half a cell above the nodes
-                that hold them: with half a cell they stop at the surface.
             state: Where bodies are and how they move; the model's initial state when None.
 
         Raises:
-            ConfigError: If the inset is negative, no shape collides with particles, or one has a form whose distance
-                cannot be queried.
+            ConfigError: If no shape collides with particles, or one has a form whose distance cannot be queried.
         """
         words = [boundary] * model.shape_count if isinstance(boundary, str) else list(boundary)
         if len(words) != model.shape_count:
@@ -64,7 +60,6 @@ class GridShapes:
                 "model: no shape collides with particles",
                 hint="add one, or leave has_particle_collision of its ShapeConfig as it is",
             )
-        require_number("inset", inset, at_least=0.0, unit="m")
         self.model = model
         table, self._alive = shape_table(model)
         codes = np.array([get_args(Boundary).index(word) for word in words], dtype=np.int32)
@@ -72,7 +67,6 @@ class GridShapes:
         """World of each shape that acts, -1 for all of them."""
         self._found = found
         self.obstacles = Obstacles()
-        self.obstacles.inset = inset
         with wp.ScopedDevice(model.device):
             self.obstacles.index = wp.array(found.astype(np.int32), dtype=int)
             self.obstacles.world = wp.array(self.worlds.astype(np.int32), dtype=int)
@@ -96,7 +90,7 @@ class GridShapes:
         """
         model = self.model
         edges = host(model.shape_collision_aabb_upper) - host(model.shape_collision_aabb_lower)
-        thin = edges.min(axis=1) + 2.0 * (host(model.shape_margin) - self.obstacles.inset)
+        thin = edges.min(axis=1) + 2.0 * host(model.shape_margin)
         solid = np.isin(host(model.shape_type), (PLANE, HEIGHTFIELD), invert=True)
         for shape in self._found[(solid & (thin < spacing))[self._found]]:
             raise ConfigError(
