@@ -27,8 +27,8 @@ DOUGH = Material(youngs_modulus=3.0e4, poissons_ratio=0.35, density=1200.0, mode
 WAIST, COIN, RADIUS = -0.016, 0.014, 0.010  # Where fingers and coin act along x, and the coin's radius [m].
 FINE = 5.0e-3  # What stays of the print with cells of 2 mm [m].
 TIMES = (0.0, 0.25, 0.35, 0.5, 0.55, 0.7, 0.8)  # When the drives are where the next two lines say [s].
-FINGER = (0.022, 0.009, 0.024, 0.024, 0.024, 0.024, 0.024)  # From the middle to each finger [m].
-PRESS = (0.006, 0.006, 0.006, -0.006, -0.006, 0.010, 0.010)  # Of the coin above the dough [m].
+FINGER = (0.022, 0.009, 0.030, 0.050, 0.050, 0.050, 0.050)  # From the middle to each finger [m].
+PRESS = (0.020, 0.020, 0.015, -0.006, -0.006, 0.030, 0.030)  # Of the coin above the dough [m].
 
 
 def slide(builder: newton.ModelBuilder, axis: tuple[float, ...], at: tuple[float, ...]) -> int:
@@ -79,8 +79,8 @@ class Kitchen:
         ones = np.ones((body.count, 3))
         look = {"quats": ones[:, :1] * [0.0, 0.0, 0.0, 1.0], "scales": 0.55 * h * ones, "opacities": 0.95 * ones[:, 0]}
         splats = SplatArrays.from_splats([Splats(means=self.rest, sh=sh, **look)])
-        eye, target = (0.03, -0.14, 0.11), (0.0, 0.0, 0.010)
-        view = PinholeCamera.look_at("film", position=eye, target=target, width=4 * edge // 3, height=edge, fov_y=0.5)
+        eye, target = (0.03, -0.13, 0.15), (0.0, 0.0, 0.010)
+        view = PinholeCamera.look_at("film", position=eye, target=target, width=4 * edge // 3, height=edge, fov_y=0.45)
         self.camera = SplatCamera(model, splats, [view])
 
     def play(self, film: Film, rate: int) -> None:

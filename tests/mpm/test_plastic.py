@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import newton
 import numpy as np
 import pytest
 import warp as wp
 
-from softmode.deformables import Material
 from softmode.deformables.materials.material_kernels import MaterialModel
 from softmode.errors import MaterialError
-from softmode.mpm import Grid, GridShapes, MpmOptions, MpmSimulation, particles_from_shape
+from softmode.mpm import MpmOptions
 from softmode.mpm.plastic_kernels import return_to_yield
 from tests.mpm.scenes import ball, moving
 from tests.mpm.test_kernels import stress
@@ -86,7 +84,5 @@ def test_below_its_yield_stress_a_body_has_the_bits_of_an_elastic_one() -> None:
 def test_a_yield_stress_is_positive() -> None:
     """Zero or less, or no number, is refused with the remedy."""
     for wrong in (0.0, -1.0, float("nan")):
-        with pytest.raises(
-            MaterialError, match=r"yield_stress must be .* > 0 Pa.*None for an elastic body"
-        ):
+        with pytest.raises(MaterialError, match=r"yield_stress must be .* > 0 Pa.*None for an elastic body"):
             replace(ball(2.2), yield_stress=wrong)

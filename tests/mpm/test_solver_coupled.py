@@ -99,19 +99,17 @@ def test_a_gripper_lifts_a_lump_and_its_wrist_feels_the_weight() -> None:
     free = bear(0.0, -0.015, 100)
     for step in range(10):
         bear(0.001 * (step + 1), -0.015, 10)
-    squeezed = bear(0.012, -0.015, 60)
-    height = s.first.x.numpy()[0, :, 2].mean()
+    bear(0.012, -0.015, 60)
     for step in range(10):
         bear(0.012, -0.015 + 0.003 * (step + 1), 16)
-    bear(0.012, 0.015, 200)
-    lifted = np.mean([bear(0.012, 0.015, 2) for _ in range(100)])
+    bear(0.012, 0.015, 100)
+    lifted = np.mean([bear(0.012, 0.015, 2) for _ in range(60)])  # it swings a little: two periods
     s.check()
     x = s.first.x.numpy()[0]
-    print("GRIP", free, squeezed, lifted, lifted - free, body.mass * GRAVITY, x[:, 2].mean() - height, x.min(axis=0), x.max(axis=0), scene.state.joint_q.numpy(), scene.control.joint_target_q.numpy())
-    print("HELD", [round(bear(0.012, 0.015, 2)-free,4) for _ in range(30)], s.first.v.numpy()[0].mean(axis=0))
+    assert free == pytest.approx((1.0 + 2.0 * GRIPPER["finger_mass"]) * GRAVITY, rel=1e-3)
     assert lifted - free == pytest.approx(body.mass * GRAVITY, rel=0.02)
     assert x[:, 2].min() > 0.02
-    assert free == pytest.approx((1.0 + 2.0 * GRIPPER["finger_mass"]) * GRAVITY, rel=1e-3)
+    assert np.abs(x[:, 1]).max() < 0.025
 
 
 def test_faults_of_a_step() -> None:
