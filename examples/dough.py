@@ -1,8 +1,7 @@
 """Two fingers pinch a waist into dough, then a coin is pressed into it: particles that yield, beside a robot.
 
 Fingers and coin hang on drives that MuJoCo moves. They push the particles, and the particles push back. Where stress
-comes to the yield stress the dough flows: what was pressed stays pressed. ``--cell 2`` is the fine run that the depth
-of the coin's print is compared with.
+comes to the yield stress the dough flows. ``--cell 2`` is the fine run that the depth of the print is compared with.
 
 Run: ``python examples/dough.py [--video out/dough.mp4] [--cell MM] [--short]``
 """
@@ -10,7 +9,6 @@ Run: ``python examples/dough.py [--video out/dough.mp4] [--cell MM] [--short]``
 import argparse
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import newton
 import numpy as np
@@ -26,7 +24,7 @@ SIZE, YIELD = np.array([0.064, 0.032, 0.018]), 800.0  # Edges [m] and yield stre
 DOUGH = Material(youngs_modulus=3.0e4, poissons_ratio=0.35, density=1200.0, model=MaterialModel.COROTATED)
 WAIST, COIN, RADIUS = -0.016, 0.014, 0.010  # Where fingers and coin act along x, and the coin's radius [m].
 FINE = 5.0e-3  # What stays of the print with cells of 2 mm [m].
-TIMES = (0.0, 0.25, 0.35, 0.5, 0.55, 0.7, 0.8)  # When the drives are where the next two lines say [s].
+TIMES = (0.0, 0.12, 0.18, 0.26, 0.28, 0.36, 0.40)  # When the drives are where the next two lines say [s].
 FINGER = (0.022, 0.009, 0.030, 0.050, 0.050, 0.050, 0.050)  # From the middle to each finger [m].
 PRESS = (0.020, 0.020, 0.015, -0.006, -0.006, 0.030, 0.030)  # Of the coin above the dough [m].
 
@@ -52,8 +50,8 @@ class Kitchen:
             builder.add_shape_box(finger, hx=0.007, hy=0.008, hz=0.018, cfg=steel, color=(0.30, 0.33, 0.38))
         coin = slide(builder, (0.0, 0.0, 1.0), (COIN, 0.0, SIZE[2] + 0.008))
         builder.add_shape_cylinder(coin, radius=RADIUS, half_height=0.008, cfg=steel, color=(0.85, 0.65, 0.2))
-        model: Any = builder.finalize()
-        model.joint_q.assign([FINGER[0], FINGER[0], PRESS[0]])
+        builder.joint_q = [FINGER[0], FINGER[0], PRESS[0]]
+        model = builder.finalize()
         self.states, self.control = (model.state(), model.state()), model.control()
         for state in self.states:
             newton.eval_fk(model, model.joint_q, model.joint_qd, state)
@@ -63,7 +61,7 @@ class Kitchen:
         body = particles_from_shape(lambda x: x[:, 2] > 0.0, bounds, spacing=h, material=DOUGH)
         grid = Grid.around(1.3 * low, 1.3 * low + 1.6 * SIZE, spacing=cell, room=2)
         grid = replace(grid, origin=(*grid.origin[:2], -4.01 * cell))  # A layer of nodes lies just within the table.
-        options = MpmOptions(grid=grid, dt=0.1 * cell, gravity=(0.0, 0.0, -9.81), damping=10.0)
+        options = MpmOptions(grid=grid, dt=0.13 * cell, gravity=(0.0, 0.0, -9.81), damping=10.0)
         shapes, body = GridShapes(model, state=self.states[0]), replace(body, yield_stress=YIELD)
         self.dough, self.rest = MpmSimulation(body, options, step_count=2, shapes=shapes), body.positions
         self.solver = SolverCoupledParticles(SolverMuJoCo(model), self.dough)
@@ -76,8 +74,8 @@ class Kitchen:
 
         stripes = np.floor(self.rest[:, :2] / 0.008).sum(axis=1, keepdims=True) % 2
         sh = (np.array([0.93, 0.84, 0.66]) - stripes * [0.10, 0.16, 0.22] - 0.5)[:, None] / 0.2820948
-        ones = np.ones((body.count, 3))
-        look = {"quats": ones[:, :1] * [0.0, 0.0, 0.0, 1.0], "scales": 0.55 * h * ones, "opacities": 0.95 * ones[:, 0]}
+        one = np.ones((body.count, 1))
+        look = {"quats": one * [0.0, 0.0, 0.0, 1.0], "scales": one * [0.55 * h] * 3, "opacities": 0.95 * one[:, 0]}
         splats = SplatArrays.from_splats([Splats(means=self.rest, sh=sh, **look)])
         eye, target = (0.03, -0.13, 0.15), (0.0, 0.0, 0.010)
         view = PinholeCamera.look_at("film", position=eye, target=target, width=4 * edge // 3, height=edge, fov_y=0.45)
@@ -90,7 +88,7 @@ class Kitchen:
             if int(time * rate) != int((time - span) * rate) or time + span > TIMES[-1]:
                 self.camera.splats.means.assign(self.dough.first.x.numpy())
                 self.camera.render(self.states[0])
-                film.add(self.camera.images("film").numpy()[0].copy(), max(rate // 4, 1))
+                film.add(self.camera.images("film").numpy()[0].copy(), rate // 8)
             finger, press = np.interp(time, TIMES, FINGER), np.interp(time, TIMES, PRESS)
             self.control.joint_target_q.assign([finger, finger, press])
             wp.capture_launch(self.graph)
@@ -116,7 +114,7 @@ def main() -> None:
     given = parser.parse_args()
     kitchen = Kitchen(1e-3 * given.cell, 96 if given.short else 480)
     with Film(given.video) as film:
-        kitchen.play(film, 10 if given.short else 100)
+        kitchen.play(film, 20 if given.short else 200)
         film.publish()
     test_final(kitchen.dough, kitchen.rest)
 
