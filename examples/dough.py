@@ -13,7 +13,6 @@ from pathlib import Path
 import newton
 import numpy as np
 import warp as wp
-from newton.solvers import SolverMuJoCo
 
 from softmode.deformables import Material, MaterialModel
 from softmode.mpm import Grid, GridShapes, MpmOptions, MpmSimulation, SolverCoupledParticles, particles_from_shape
@@ -64,14 +63,13 @@ class Kitchen:
         options = MpmOptions(grid=grid, dt=0.13 * cell, gravity=(0.0, 0.0, -9.81), damping=10.0)
         shapes, body = GridShapes(model, state=self.states[0]), replace(body, yield_stress=YIELD)
         self.dough, self.rest = MpmSimulation(body, options, step_count=2, shapes=shapes), body.positions
-        self.solver = SolverCoupledParticles(SolverMuJoCo(model), self.dough)
+        self.solver = SolverCoupledParticles(newton.solvers.SolverMuJoCo(model), self.dough)
         self.solver.step(*self.states, self.control, None, self.solver.dt)  # Compiles the kernels.
         with wp.ScopedCapture() as capture:
             for first, second in (self.states, self.states[::-1]):
                 self.solver.step(first, second, self.control, None, self.solver.dt)
         self.graph = capture.graph
         self.solver.reset(self.states[0])
-
         stripes = np.floor(self.rest[:, :2] / 0.008).sum(axis=1, keepdims=True) % 2
         sh = (np.array([0.93, 0.84, 0.66]) - stripes * [0.10, 0.16, 0.22] - 0.5)[:, None] / 0.2820948
         one = np.ones((body.count, 1))
@@ -89,9 +87,9 @@ class Kitchen:
                 self.camera.splats.means.assign(self.dough.first.x.numpy())
                 self.camera.render(self.states[0])
                 film.add(self.camera.images("film").numpy()[0].copy(), rate // 8)
-            finger, press = np.interp(time, TIMES, FINGER), np.interp(time, TIMES, PRESS)
-            self.control.joint_target_q.assign([finger, finger, press])
+            self.control.joint_target_q.assign([np.interp(time, TIMES, at) for at in (FINGER, FINGER, PRESS)])
             wp.capture_launch(self.graph)
+        film.publish()
         self.dough.check()
 
 
@@ -107,7 +105,7 @@ def test_final(dough: MpmSimulation, rest: np.ndarray) -> None:
 
 def main() -> None:
     """Film the kitchen."""
-    parser = argparse.ArgumentParser(description="Shape dough")
+    parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--video", type=Path, default=Path("out/dough.mp4"))
     parser.add_argument("--cell", type=float, default=4.0, help="edge of a cell of the grid [mm]")
     parser.add_argument("--short", action="store_true", help="small pictures")
@@ -115,7 +113,6 @@ def main() -> None:
     kitchen = Kitchen(1e-3 * given.cell, 96 if given.short else 480)
     with Film(given.video) as film:
         kitchen.play(film, 20 if given.short else 200)
-        film.publish()
     test_final(kitchen.dough, kitchen.rest)
 
 
