@@ -72,12 +72,8 @@ class Kitchen:
         self.solver.reset(self.states[0])
         stripes = np.floor(self.rest[:, :2] / 0.008).sum(axis=1, keepdims=True) % 2
         sh = (np.array([0.93, 0.84, 0.66]) - stripes * [0.10, 0.16, 0.22] - 0.5)[:, None] / 0.2820948
-        one = np.ones((body.count, 1))
-        look = {
-            "quats": one * [0.0, 0.0, 0.0, 1.0],
-            "scales": 0.55 * h * one * np.ones(3),
-            "opacities": 0.95 * one[:, 0],
-        }
+        one, width = np.ones((body.count, 1)), np.full(3, 0.55 * h)
+        look = {"quats": one * [0.0, 0.0, 0.0, 1.0], "scales": one * width, "opacities": 0.95 * one[:, 0]}
         splats = SplatArrays.from_splats([Splats(means=self.rest, sh=sh, **look)])
         eye, target = (0.03, -0.13, 0.15), (0.0, 0.0, 0.010)
         view = PinholeCamera.look_at("film", position=eye, target=target, width=4 * edge // 3, height=edge, fov_y=0.45)
