@@ -61,7 +61,7 @@ class SolverCoupledParticles(SolverBase):
     ) -> None:
         """Advance everything by ``dt`` [s], that of all steps of the particles.
 
-        ``particles.first`` is where the particles are then; ``particles.check()`` says which have left the grid.
+        ``particles.first`` is where the particles are then; ``MpmSimulation.check`` says which have left the grid.
 
         Args:
             state_in: Where bodies are, with ``body_q`` of their joints (``newton.eval_fk``).

@@ -151,9 +151,9 @@ def sag(dx: float, gravity: float) -> float:
     cells = (int(15 / dx), int(8 / dx), int(10 / dx))
     grid = Grid(shape=(cells[0] + 1, cells[1] + 1, cells[2] + 1), spacing=dx, origin=(-3.0, -4.0, -6.0))
     dt = 0.4 * dx / np.sqrt(modulus / density)
-    options = MpmOptions(grid=grid, dt=dt, damping=8.0 * frequency, gravity=(0.0, 0.0, -gravity), precision="float64")
+    options = MpmOptions(grid=grid, dt=dt, damping=2.0 * frequency, gravity=(0.0, 0.0, -gravity), precision="float64")
     s = MpmSimulation(bar, options, step_count=100, shapes=shapes, device="cpu")
-    for _ in range(round(2.5 / frequency / dt / 100)):
+    for _ in range(round(9.0 / frequency / dt / 100)):
         s.forward()
         s.check()
         s.first.copy_from(s.last)
