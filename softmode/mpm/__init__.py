@@ -30,5 +30,6 @@ if TYPE_CHECKING:
     from softmode.mpm.simulation import MpmSimulation as MpmSimulation
     from softmode.mpm.simulation import ParameterBars as ParameterBars
     from softmode.mpm.simulation import ParticleState as ParticleState
+    from softmode.mpm.solver_coupled import SolverCoupledParticles as SolverCoupledParticles
 
 __getattr__, __dir__ = lazy_names(__name__)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from softmode.checks import require_number
 from softmode.deformables import Material, ReducedBody
-from softmode.errors import AssetError, ConfigError
+from softmode.errors import AssetError, ConfigError, MaterialError
 from softmode.mpm.particle_kernels import in_mesh
 
 Array = NDArray[np.float64]
@@ -27,6 +27,9 @@ class ParticleBody:
     """Masses [kg], shape (N,)."""
     material: Material = field(default_factory=Material)
     """Energy, Young's modulus and Poisson's ratio; density is in the masses, viscosity is not used."""
+    yield_stress: float | None = None
+    """Kirchhoff stress, J times that of Cauchy, at which a bar that is pulled begins to flow [Pa]: von Mises plasticity
+    without hardening, which keeps volume. None is elastic."""
 
     def __post_init__(self) -> None:
         """Check shapes and values."""
@@ -38,6 +41,9 @@ class ParticleBody:
             raise AssetError("positions: expected finite coordinates")
         if not (np.isfinite(self.masses).all() and (self.masses > 0.0).all()):
             raise AssetError("masses: expected finite values > 0")
+        if self.yield_stress is not None:
+            hint = "give it in Pa, or None for an elastic body"
+            require_number("yield_stress", self.yield_stress, above=0.0, unit="Pa", hint=hint, error=MaterialError)
 
     @property
     def count(self) -> int:

@@ -483,7 +483,8 @@ class MorphPlanner:
         """SHA-256 of bodies, targets and options."""
         found = hashlib.sha256(repr(self.options).encode())
         for body in (*self.simulation.bodies, *self.targets):
-            found.update(repr((body.count, body.material)).encode())
+            limit = () if body.yield_stress is None else (body.yield_stress,)
+            found.update(repr((body.count, body.material, *limit)).encode())
             for array in (body.positions, body.masses):
                 found.update(np.ascontiguousarray(array, dtype=np.float64).tobytes())
         return found.hexdigest()

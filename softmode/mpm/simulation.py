@@ -19,9 +19,11 @@ from softmode.mpm.adjoint_kernels import grid_to_particles_adjoint, move_grid_ad
 from softmode.mpm.grid import Grid
 from softmode.mpm.options import COURANT_LIMIT, MpmOptions
 from softmode.mpm.particles import ParticleBody
+from softmode.mpm.plastic_kernels import return_to_yield, return_to_yield_adjoint
 from softmode.mpm.shape_kernels import add_wrenches, collide_grid, collide_grid_adjoint, find_inside
 from softmode.mpm.shapes import GridShapes
 from softmode.mpm.step_kernels import (
+    LEFT_GRID,
     clear_failures,
     grid_to_particles,
     mass_to_grid,
@@ -103,6 +105,8 @@ class ParameterBars:
     """By mu [1/Pa], (W, N)."""
     lam: wp.array
     """By lambda [1/Pa], (W, N)."""
+    yield_stress: wp.array
+    """By the yield stress [1/Pa], (W, N)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -176,6 +180,10 @@ class MpmSimulation:
             for body in self.bodies
         ]
         self.mu, self.lam = (self._array(np.tile([[c[k]] for c in lame], self.count), self._real) for k in (0, 1))
+        limits = [np.full(body.count, body.yield_stress or 0.0) for body in self.bodies]
+        self.yield_stress = self._array(self._padded(limits), self._real)
+        """Yield stress [Pa], (W, N); 0 where particles are elastic."""
+        self._plastic = any(body.yield_stress is not None for body in self.bodies)
         self.volume = self._zeros(self._real, self.world_count, self.count)
         self.shapes = shapes
         self.impulse = self._zeros(
@@ -389,7 +397,7 @@ class MpmSimulation:
             Derivatives by the first state, and by what does not move.
         """
         states, parameters = self._gradients()
-        for bar in (parameters.control, parameters.mu, parameters.lam):
+        for bar in (parameters.control, parameters.mu, parameters.lam, parameters.yield_stress):
             bar.zero_()
         now = 0
         for chunk in reversed(range(max(len(self._marks), 1))):
@@ -417,11 +425,16 @@ class MpmSimulation:
         found = self.failure.numpy()
         bad = np.flatnonzero(found[:, 0])
         if len(bad):
-            _, kind, step, particle = found[bad[0]]
-            raise SolverDiverged(
-                f"world {bad[0]}, step {step}: particle {particle} {REASONS[int(kind)]}",
-                hint="take smaller steps, a larger grid, more damping or a weaker control",
-            )
+            world = bad[0]
+            _, kind, step, particle = found[world]
+            hint, told = "take smaller steps, more damping or a weaker control", ""
+            if kind == LEFT_GRID:
+                count = self.bodies[world].count
+                out = count - int(self.options.grid.holds(self.last.x.numpy()[world, :count]).sum())
+                told = f"; {out} of {count} are outside, where they stand still and weigh nothing"
+                hint = "take a larger grid (Grid.around(..., room=)), more damping, a weaker control or slower shapes"
+            what = f"particle {particle} {REASONS[int(kind)]}{told}"
+            raise SolverDiverged(f"world {world}, step {step}: {what}", hint=hint)
 
     def wrenches(self) -> Array:
         """Return the mean wrench of the last run on each shape of the model [N] and [N m], shape (W, shapes, 6)."""
@@ -462,6 +475,7 @@ class MpmSimulation:
                 mass=self._zeros(self._real, *shape),
                 mu=self._zeros(self._real, *shape),
                 lam=self._zeros(self._real, *shape),
+                yield_stress=self._zeros(self._real, *shape),
             )
             self._fs_bar = self._zeros(self._mat, *shape)
             self._bars = ([self._state(), self._state()], parameters)
@@ -598,6 +612,14 @@ class MpmSimulation:
             ],
         )
 
+        if self._plastic:
+            self._launch(return_to_yield, [*self._strengths, self.active, then.F])
+
+    @property
+    def _strengths(self) -> list[object]:
+        """Return what both kernels of plasticity read of the particles."""
+        return [self.mass, self.mu, self.lam, self.yield_stress, self._model]
+
     def _step_back(
         self,
         step: int,
@@ -610,6 +632,10 @@ class MpmSimulation:
         """Carry the bars of a step's result to its start. A grid that was not kept is computed again."""
         o = self.options
         grid = self._grids[step] if self._keeps_grids else self._move_grid(step, now)
+        if self._plastic:
+            tried = [now.F, self._control_at(step), then.C, int(o.control == "material")]
+            tried += [self._real(o.dt), self._real(o.smoothing), *self._strengths, bar_then.F]
+            self._launch(return_to_yield_adjoint, [*tried, parameters.mu, parameters.lam, parameters.yield_stress])
         self._scatter(
             grid_to_particles_adjoint,
             [

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import warp as wp
@@ -13,8 +15,8 @@ OPTIONS = MpmOptions(precision="float64", control="additive", smoothing=0.5, dam
 
 
 def started(device: str) -> MpmSimulation:
-    """Return a ball with random velocities and controls on a device."""
-    body, rng = ball(2.5), np.random.default_rng(0)
+    """Return a ball that yields, with random velocities and controls, on a device."""
+    body, rng = replace(ball(2.5), yield_stress=6000.0), np.random.default_rng(0)
     found = MpmSimulation(body, OPTIONS, step_count=10, device=device)
     found.start(v=rng.standard_normal((1, body.count, 3)))
     found.control.assign(0.02 * rng.standard_normal((*found.control.shape, 3, 3)))
@@ -29,7 +31,8 @@ def run(device: str) -> dict[str, np.ndarray]:
     s.forward()
     loss.after(s, value)
     _, bars = loss.gradient(s)
-    return {"x": s.last.x.numpy(), "F": s.last.F.numpy(), "loss": value.numpy(), "control": bars.control.numpy()}
+    found = {"x": s.last.x, "F": s.last.F, "loss": value, "control": bars.control, "yield stress": bars.yield_stress}
+    return {name: array.numpy() for name, array in found.items()}
 
 
 @pytest.mark.gpu

@@ -153,7 +153,7 @@ def sag(dx: float, gravity: float) -> float:
     dt = 0.4 * dx / np.sqrt(modulus / density)
     options = MpmOptions(grid=grid, dt=dt, damping=2.0 * frequency, gravity=(0.0, 0.0, -gravity), precision="float64")
     s = MpmSimulation(bar, options, step_count=100, shapes=shapes, device="cpu")
-    for _ in range(round(12.0 / frequency / dt / 100)):
+    for _ in range(round(9.0 / frequency / dt / 100)):
         s.forward()
         s.check()
         s.first.copy_from(s.last)

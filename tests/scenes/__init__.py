@@ -31,7 +31,7 @@ class Scene:
         world_count: Number of copies.
         gravity: Gravity [m/s^2]; default none.
         ground: Friction of a ground plane z = 0, or None for no ground.
-        coupled: Two-way with MuJoCo.
+        coupled: Two-way with MuJoCo; MuJoCo alone where there are no reduced bodies.
         options: Solver options.
         dt: Step [s].
         finish: Called with the model before the solver is built, to change what the builder cannot.
@@ -74,8 +74,10 @@ class Scene:
         self.solver: Any
         if coupled:
             rigid = SolverMuJoCo(self.model, **{"njmax": 64, "nconmax": 32} | (mujoco or {}))
-            self.solver = SolverCoupledReduced(self.model, bodies, rigid=rigid, options=options)
-            self.reduced: SolverReduced = self.solver.reduced
+            self.solver = rigid
+            if bodies:
+                self.solver = SolverCoupledReduced(self.model, bodies, rigid=rigid, options=options)
+                self.reduced: SolverReduced = self.solver.reduced
         else:
             self.solver = self.reduced = SolverReduced(self.model, bodies, options=options)
         self.control: Any = self.model.control()
