@@ -129,6 +129,54 @@ def test_an_object_by_files_and_density(tmp_path) -> None:
         ObjectConfig(body="body.npz", density_file=tmp_path / "dense.npz")
 
 
+def test_an_object_by_a_material_field(tmp_path) -> None:
+    """E, nu and rho of a file are those of the body's points; colours are factors on top; the mass is the field's.
+
+    Files that do not fit, values out of range, and points beside the object are refused.
+    """
+    steps = [np.linspace(-0.5 * s, 0.5 * s, 9) for s in SIZE]
+    points = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3) + (0.0, 0.0, 0.5 * SIZE[2])
+    upper = points[:, 2] > 0.5 * SIZE[2]
+    lower = {"youngs_modulus": 1e5, "poissons_ratio": 0.2, "density": 300.0}
+    values = {name: np.where(upper, 2.0 * value, value) for name, value in lower.items()}
+
+    def written(**changes: object) -> Path:
+        arrays = {"points": points, **values, **changes}
+        np.savez(tmp_path / "field.npz", **{name: array for name, array in arrays.items() if array is not None})
+        return tmp_path / "field.npz"
+
+    shape = {"shape": "box", "extents": SIZE, "splat_count": 800, "surface_count": 80, "build": OPTIONS}
+    base = ObjectConfig(**shape, colors=(RED, RED), stiffness_colors=(StifferColor(color=RED, factor=3.0),))
+    thing = load(base.changed(material_file=written()))
+    given, made = unpack_sources(thing.body), thing.material
+    high = given.quadrature.points[:, 2] - given.quadrature.bounds[0, 2] > 0.53 * SIZE[2]  # beside the jump
+    low = given.quadrature.points[:, 2] - given.quadrature.bounds[0, 2] < 0.47 * SIZE[2]
+    assert made is not None and given.stiffness_scale is not None and given.poissons_ratio is not None
+    for where, factor in ((high, 2.0), (low, 1.0)):
+        np.testing.assert_allclose(made.youngs_modulus * given.stiffness_scale[where], factor * 3e5)
+        np.testing.assert_allclose(given.poissons_ratio[where], factor * 0.2)
+    assert made.poissons_ratio == pytest.approx(given.options.poissons_ratios[0])
+    assert given.density_scale is not None
+    share = given.quadrature.weights @ given.density_scale / given.quadrature.volume
+    np.testing.assert_allclose(made.density * given.density_scale[high] / share, 600.0)
+    sparse = base.changed(material_file=written(points=points * (1.0, 1.0, 0.8)))
+    with pytest.warns(RuntimeWarning, match="miss .* % of the object"):
+        load(sparse)
+    bad = {
+        "one for each": {"density": np.ones(3)},
+        "nu < 0.5": {"poissons_ratio": np.full(len(points), 0.5)},
+        "youngs_modulus: expected > 0": {"youngs_modulus": np.zeros(len(points))},
+        "finite": {"points": points * np.nan},
+        "no property": dict.fromkeys(values),
+        "miss": {"points": points + (0.0, 0.0, 0.6 * SIZE[2])},
+    }
+    for match, changes in bad.items():
+        with pytest.raises(MaterialError, match=match):
+            load(base.changed(material_file=written(**changes)))
+    with pytest.raises(AssetError, match="holds"):
+        load(base.changed(material_file=written(points=None)))
+
+
 def test_the_reach_of_a_brush() -> None:
     """A cylinder along the normal, of radius and depth; strokes are unions."""
     points = np.random.default_rng(1).uniform(-1.0, 1.0, (500, 3))
