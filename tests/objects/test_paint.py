@@ -135,7 +135,7 @@ def test_an_object_by_a_material_field(tmp_path) -> None:
     Files that do not fit, values out of range, and points beside the object are refused.
     """
     steps = [np.linspace(-0.5 * s, 0.5 * s, 9) for s in SIZE]
-    points = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3) + (0.0, 0.0, 0.5 * SIZE[2])
+    points = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3) + np.array([0.0, 0.0, 0.5 * SIZE[2]])
     upper = points[:, 2] > 0.5 * SIZE[2]
     lower = {"youngs_modulus": 1e5, "poissons_ratio": 0.2, "density": 300.0}
     values = {name: np.where(upper, 2.0 * value, value) for name, value in lower.items()}
@@ -168,7 +168,7 @@ def test_an_object_by_a_material_field(tmp_path) -> None:
         "youngs_modulus: expected > 0": {"youngs_modulus": np.zeros(len(points))},
         "finite": {"points": points * np.nan},
         "no property": dict.fromkeys(values),
-        "miss": {"points": points + (0.0, 0.0, 0.6 * SIZE[2])},
+        "miss": {"points": points + np.array([0.0, 0.0, 0.6 * SIZE[2]])},
     }
     for match, changes in bad.items():
         with pytest.raises(MaterialError, match=match):
