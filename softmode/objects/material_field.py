@@ -6,6 +6,8 @@ import os
 import warnings
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +16,9 @@ from scipy.spatial import KDTree
 from softmode.deformables.reduction.build_body import require_ratios
 from softmode.errors import AssetError, MaterialError
 from softmode.files import UNPACKED_FREE, damage_errors, read_arrays
+from softmode.foreign import process, tokens
+from softmode.splats.formats.usd import UP_AXES
+from softmode.splats.splats import up_rotation
 
 Array = NDArray[np.float64]
 
@@ -24,6 +29,12 @@ REACH = 2.0
 """Distance beyond which a point says nothing, over the spacing of the points: 1.7 in the corner of a cubic grid."""
 CONTRAST = 1.0e6
 """Largest Young's modulus or density over the least."""
+_PRIMVARS = {
+    "youngs_modulus": ("youngs_modulus", "youngsModulus"),
+    "poissons_ratio": ("poissons_ratio", "poissonsRatio"),
+    "density": ("density",),
+}
+_LIMITS = process.Limits(memory=128 * 2.0**20, memory_per_byte=16.0, seconds=1.0)
 _HINT = "give an .npz with points (N, 3) [m] and youngs_modulus [Pa], poissons_ratio or density [kg/m^3], each (N,)"
 
 
@@ -101,16 +112,45 @@ class MaterialField:
 
 
 def read_material(path: str | os.PathLike[str]) -> MaterialField:
-    """Read a field of material: an .npz with `points` (N, 3) [m] and some of `PROPERTIES`, (N,) each.
+    """Read a field of material in SI units: an .npz with `points` (N, 3) and some of `PROPERTIES`, (N,) each.
+
+    Or an OpenUSD stage whose `Points` prims have primvars of these names, or `youngsModulus` and `poissonsRatio`. The
+    stage's unit of length and its up axis are applied to the points.
 
     Raises:
         AssetError: If the file is missing or damaged, or holds no points.
         MaterialError: If its arrays do not fit, or a value lies outside its range.
     """
     name = f"material {path}"
-    arrays = read_arrays(path, ("points", *PROPERTIES), what="material", hint=_HINT, free=UNPACKED_FREE // 2)
+    if os.fspath(path).lower().endswith(tokens.SUFFIXES):
+        arrays = _stage_arrays(Path(path), name)
+    else:
+        arrays = read_arrays(path, ("points", *PROPERTIES), what="material", hint=_HINT, free=UNPACKED_FREE // 2)
     if "points" not in arrays:
         raise AssetError(f"{name}: holds {sorted(arrays)}", hint=_HINT)
     with damage_errors(name, hint=_HINT):
         found = {key: np.asarray(value, dtype=np.float64) for key, value in arrays.items()}
     return MaterialField(name=name, points=found.pop("points"), values=found)
+
+
+def _stage_arrays(file: Path, name: str) -> dict[str, NDArray[Any]]:
+    """Return the points of a stage's `Points` prims [m], z up, and what their primvars say; nothing if there are none.
+
+    Raises:
+        AssetError: If the stage cannot be read, or its prims have different properties.
+    """
+    answer = process.read("field", file, name=name, limits=_LIMITS, primvars=_PRIMVARS)
+    stage, sent = answer.described, answer.arrays
+    prims = stage["prims"]
+    if not prims:
+        return {}
+    if any(prim["values"].keys() != prims[0]["values"].keys() for prim in prims) or stage["up"] not in UP_AXES:
+        raise AssetError(f"{name}: its Points prims have different primvars, or an unknown up axis", hint=_HINT)
+    upright = float(stage["meters"]) * up_rotation(UP_AXES[stage["up"]])
+    with damage_errors(name, hint=_HINT):
+        points = []
+        for prim in prims:
+            matrix = np.array(prim["matrix"]).reshape(4, 4)
+            points.append((sent[prim["points"]].reshape(-1, 3) @ matrix[:3, :3] + matrix[3, :3]) @ upright.T)
+        values = {key: np.concatenate([sent[prim["values"][key]] for prim in prims]) for key in prims[0]["values"]}
+        return {"points": np.concatenate(points), **values}

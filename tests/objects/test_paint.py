@@ -16,6 +16,7 @@ from softmode.deformables.reduction.reduced_stiffness import reduced_stiffness
 from softmode.deformables.reduction.sources import unpack_sources
 from softmode.errors import AssetError, ConfigError, MaterialError
 from softmode.objects import ObjectConfig, StifferColor, color_field, load, nearest_field, read_field
+from softmode.objects.material_field import read_material
 from softmode.objects.paint import brushed
 from softmode.splats.point_cloud import splats_from_points
 
@@ -175,6 +176,24 @@ def test_an_object_by_a_material_field(tmp_path) -> None:
             load(base.changed(material_file=written(**changes)))
     with pytest.raises(AssetError, match="holds"):
         load(base.changed(material_file=written(points=None)))
+
+
+def test_a_material_field_of_a_stage(tmp_path) -> None:
+    """`Points` prims with primvars: the stage's unit and up axis act on points, values are SI."""
+    Usd, UsdGeom, Sdf = (pytest.importorskip(f"pxr.{name}") for name in ("Usd", "UsdGeom", "Sdf"))
+    stage = Usd.Stage.CreateNew(str(tmp_path / "field.usda"))
+    UsdGeom.SetStageUpAxis(stage, "Y")
+    UsdGeom.SetStageMetersPerUnit(stage, 0.01)
+    prim = UsdGeom.Points.Define(stage, "/field")
+    prim.CreatePointsAttr([(1.0, 2.0, 3.0), (4.0, 5.0, 6.0)])
+    UsdGeom.Xformable(prim).AddTranslateOp().Set((0.0, 10.0, 0.0))
+    for name, values in (("youngsModulus", [1e4, 3e4]), ("density", [100.0, 300.0])):
+        primvar = UsdGeom.PrimvarsAPI(prim).CreatePrimvar(name, Sdf.ValueTypeNames.FloatArray, "vertex")
+        primvar.Set(values)
+    stage.GetRootLayer().Save()
+    field = read_material(tmp_path / "field.usda")
+    np.testing.assert_allclose(field.points, [[0.01, -0.03, 0.12], [0.04, -0.06, 0.15]], atol=1e-9)
+    assert field.means == {"youngs_modulus": 2e4, "density": 200.0}
 
 
 def test_the_reach_of_a_brush() -> None:
