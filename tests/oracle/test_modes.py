@@ -88,11 +88,11 @@ def test_two_moduli(name: str) -> None:
     assert -0.06 < low and high < 0.06
 
 
-@pytest.mark.parametrize("name", rest_but(["bar 10:1"], ["bar 10:1", "slab 0.24 x 0.06 x 0.02", "L"]))
+@pytest.mark.parametrize("name", rest_but(["L"], ["L", "bar 10:1", "plate 20:1"]))
 def test_all_properties_vary(name: str) -> None:
-    """E (eightfold), nu (.05 to .45) and rho (threefold) that all vary cost 5 % at most in the first six frequencies.
+    """E (eightfold), nu (.05 to .45) and rho (threefold) that all vary cost 1.5 % in the first six frequencies.
 
-    With the field of nu left out, frequencies would be up to a tenth off: the test could fail.
+    With the mean nu everywhere the L is 2.3 % too soft, with the mean density 1.3 %; both fields are needed.
     """
     solid = SOLIDS[name]()
     low, high = (solid.mesh().nodes.min(axis=0), solid.mesh().nodes.max(axis=0))
@@ -116,8 +116,7 @@ def test_all_properties_vary(name: str) -> None:
     at = mesh.points
     reference = free_eigenvalues(mesh, ratio(at), stiffness=modulus(at), density=density(at) / mean)
     below, above = frequency_errors(body, reference, 0.25)
-    print(name, below, above)
-    assert -0.05 < below and above < 0.05
+    assert -0.01 < below and above < 0.015
 
 
 def test_few_points_are_not_soft() -> None:
