@@ -60,6 +60,15 @@ def add_board(world: newton.ModelBuilder) -> None:
         world.add_shape_cylinder(-1, xform=place, radius=PEG, half_height=0.5 * GAP, color=(0.75, 0.2, 0.2))
 
 
+def turned_to_fit(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return a random rotation by which points (N, 3) fit between the panes and beside each other."""
+    while True:
+        turn = Rotation.from_quat(rng.normal(size=4)).as_matrix()
+        width, depth, _ = np.ptp(points @ turn.T, axis=0)
+        if width < 0.085 and depth < GAP - 0.006:
+            return turn
+
+
 def make_scene(own: list[str | ObjectConfig], seed: int, height: int, device: str | None) -> SplatScene:
     """Build the board and three rows of six toys over it, turned at random, in random order."""
     world, rng = newton.ModelBuilder(), np.random.default_rng(seed)
@@ -71,7 +80,7 @@ def make_scene(own: list[str | ObjectConfig], seed: int, height: int, device: st
         stuff = thing.material or PLUSH
         stuff = replace(stuff, youngs_modulus=stiffer * stuff.youngs_modulus, friction=0.3)
         place = (0.09 * (column - 2.5) + rng.uniform(-0.005, 0.005), 0.0, 0.80 + 0.11 * row)
-        turn = Rotation.from_quat(rng.normal(size=4)).as_matrix()
+        turn = turned_to_fit(thing.body.surface.points, rng)
         placed.append(Placed(object=replace(thing, material=stuff), position=place, rotation=turn))
     eye, target, width = (0.18, -1.6, 0.75), (0.0, 0.0, 0.54), height // 40 * 24
     camera = PinholeCamera.look_at("film", position=eye, target=target, width=width, height=height, fov_y=0.70)

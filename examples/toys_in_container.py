@@ -48,10 +48,10 @@ def make_scene(own: list[str | ObjectConfig], seed: int, size: int, device: str 
     for i, source in enumerate([*own, *PRESETS[len(own) :]]):
         thing = load(source, size=SMALL.get(str(source), SIZE), surface_count=SAMPLES, build=BUILD)
         layer, cell = divmod(i, len(LAYER))
-        place = (*LAYER[cell], 0.17 + 0.13 * layer + (0.04 if cell == 0 else 0.0))
+        place = (*LAYER[cell], 0.17 + 0.14 * layer + (0.06 if cell == 0 else 0.0))
         turn = Rotation.from_quat(rng.normal(size=4)).as_matrix()
         placed.append(Placed(object=replace(thing, material=thing.material or PLUSH), position=place, rotation=turn))
-    eye, target = (0.38, -0.28, 0.46), (0.0, 0.0, 0.085)
+    eye, target = (0.27, -0.20, 0.58), (0.0, 0.0, 0.06)
     camera = PinholeCamera.look_at("film", position=eye, target=target, width=size, height=size, fov_y=0.72)
     light = CameraOptions(mesh_samples=4, splat_shadow=ShadowOptions(cells=160))
     many = SolverReducedOptions(contact_max=512)

@@ -118,7 +118,7 @@ def relative_scale(
     absolute = None if field is None else field.at(own, points)
     if not boxes and not colors and file is None and absolute is None:
         return None
-    found = np.ones(len(points)) if field is None or absolute is None else absolute / field.means[own]
+    found = np.ones(len(points))
     for part in boxes:
         inside = (points >= part.box[:3]).all(axis=1) & (points <= part.box[3:]).all(axis=1)
         if not inside.any():
@@ -131,7 +131,7 @@ def relative_scale(
         found *= color_field(splats, colors)(quadrature.points)
     if file is not None:
         found *= read_field(file)(points)
-    return found
+    return found if field is None or absolute is None else found * (absolute / field.means[own])
 
 
 def build_standing(

@@ -15,7 +15,7 @@ from softmode.deformables import BuildOptions, ReducedBody, build_body, elastic_
 from softmode.deformables.reduction.reduced_stiffness import reduced_stiffness
 from softmode.deformables.reduction.sources import unpack_sources
 from softmode.errors import AssetError, ConfigError, MaterialError
-from softmode.objects import ObjectConfig, StifferColor, color_field, load, nearest_field, read_field
+from softmode.objects import ObjectConfig, StifferBox, StifferColor, color_field, load, nearest_field, read_field
 from softmode.objects.material_field import read_material
 from softmode.objects.paint import brushed
 from softmode.splats.point_cloud import splats_from_points
@@ -131,7 +131,7 @@ def test_an_object_by_files_and_density(tmp_path) -> None:
 
 
 def test_an_object_by_a_material_field(tmp_path) -> None:
-    """E, nu and rho of a file are those of the body's points; colours are factors on top; the mass is the field's.
+    """E, nu and rho of a file are those of the body's points; a box is a factor on top; the mass is the field's.
 
     Files that do not fit, values out of range, and points beside the object are refused.
     """
@@ -147,7 +147,8 @@ def test_an_object_by_a_material_field(tmp_path) -> None:
         return tmp_path / "field.npz"
 
     shape = {"shape": "box", "extents": SIZE, "splat_count": 800, "surface_count": 80, "build": OPTIONS}
-    base = ObjectConfig(**shape, colors=(RED, RED), stiffness_colors=(StifferColor(color=RED, factor=3.0),))
+    wide = (*[-np.inf] * 3, *[np.inf] * 3)
+    base = ObjectConfig(**shape, stiffness=(StifferBox(box=wide, factor=3.0),))
     thing = load(base.changed(material_file=written()))
     given, made = unpack_sources(thing.body), thing.material
     high = given.quadrature.points[:, 2] - given.quadrature.bounds[0, 2] > 0.58 * SIZE[2]  # beside the jump

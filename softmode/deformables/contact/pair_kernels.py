@@ -85,9 +85,12 @@ NEIGHBOURHOOD = wp.constant(wp.float64(2.0))
 """Distance in spacings within which such faces are looked for."""
 DEPTH = wp.constant(0.3)
 """How deep a point may lie below a surface, as a fraction of the thicker of the two bodies there: beyond, it is seen
-from the far side, through both. Below a wall no deeper than the wall is thick: there it has come out again, or never
-was in it. A block that fell across the rim of a mug was told to be 12 mm deep in a wall of 4 mm; what the wall's own
-samples say of the block keeps it from passing."""
+from the far side, through both."""
+WINDING = wp.constant(wp.float64(0.4 * 4.0 * 3.141592653589793))
+"""4 pi times the winding number, 1 inside and 0 outside, from which on a point that is said to lie half a spacing deep,
+or half a wall, is in the body. Behind a wall, beside a corner and in a hollow a face that looks at it is no surface
+above it: a block that fell across the rim of a mug was told to be 12 mm deep in a wall of 4 mm. Where it does cut the
+wall, the wall's own samples say so."""
 SELF_DISTANCE = wp.constant(wp.float64(4.0))
 """Distance at rest, in spacings, below which samples of one body are neighbours and do not touch, unless"""
 SELF_OPENING = wp.constant(wp.float64(1.0))
@@ -258,6 +261,19 @@ def beside(samples: Samples, pairs: Pairs, x: wp.vec3d, j: int, row: int, centre
 
 
 @wp.func
+def is_inside(instances: Instances, basis: Basis, samples: Samples, pairs: Pairs, x: wp.vec3d, j: int):
+    """Return whether x lies in instance j by the winding number of its samples, sum A_k n_k . r_k / (4 pi r_k^3)."""
+    total = wp.float64(0.0)
+    for t in range(instances.sample_count[j]):
+        away = samples.position[j, t] - x
+        area = wp.float64(sample_area(instances.scale[j], basis.row_area[instances.row_start[j] + t]))
+        distance = wp.length_sq(away) + wp.float64(0.1) * area  # finite at a sample
+        slope = wp.dot(wp.vec3d(pairs.surface_normal[j, t]), away)
+        total += area * slope / (distance * wp.sqrt(distance))
+    return total > WINDING
+
+
+@wp.func
 def fit_patch(
     instances: Instances,
     basis: Basis,
@@ -300,13 +316,16 @@ def fit_patch(
     lateral = offset - wp.dot(offset, patch.normal) * patch.normal
     own = instances.scale[i] * pairs.thickness[instances.row_start[i] + s]
     wall = instances.scale[j] * pairs.thickness[row]
-    deepest = wp.min(DEPTH * wp.max(own, wall), wall)
-    if wp.length(lateral) > LATERAL * wp.float64(pairs.spacing[j]) or patch.gap < wp.float64(-deepest):
+    thick = wp.max(own, wall)
+    if wp.length(lateral) > LATERAL * wp.float64(pairs.spacing[j]) or patch.gap < wp.float64(-DEPTH * thick):
         patch.total = wp.float64(0.0)
     elif flat < FLAT and not looks_at(pairs, i, s, j, t):
         patch.total = wp.float64(0.0)
     elif beside(samples, pairs, x, j, row, x - offset, patch.normal):
         patch.total = wp.float64(0.0)
+    elif j != i and patch.gap < wp.float64(-0.5) * wp.min(wp.float64(pairs.spacing[j]), wp.float64(wall)):
+        if not is_inside(instances, basis, samples, pairs, x, j):
+            patch.total = wp.float64(0.0)
     return patch
 
 
