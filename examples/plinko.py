@@ -31,7 +31,7 @@ PEGS = np.array([(x, 0.32 + 0.12 * row) for row in range(4) for x in (WALLS if r
 """Centres (x, z) of the pegs [m], over the walls and between them."""
 SMALL = {"doughnut": 0.06, "ball": 0.055, "block-a": 0.045, "block-b": 0.045, "block-c": 0.045}
 """Longest edges of those that are thick [m]."""
-BUILD, SAMPLES, SIZE = BuildOptions(mode_count=5, cubature_count=192), 200, 0.075
+BUILD, SAMPLES, SIZE = BuildOptions(mode_count=5, cubature_count=192), 400, 0.075
 TOYS = [(name, SMALL.get(name, SIZE), 1.0) for name in PRESETS]
 TOYS += [("bear", 0.055, 4.0), ("doughnut", 0.05, 8.0), ("cushion", 0.06, 3.0)]
 """Each toy, its longest edge [m], and how many times as stiff as its preset it is."""

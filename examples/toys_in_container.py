@@ -24,7 +24,7 @@ from softmode.viz import Film
 
 HALF, HEIGHT, WALL = 0.11, 0.12, 0.012
 """Half width of the container inside, height and thickness of its walls [m]."""
-BUILD, SAMPLES = BuildOptions(mode_count=5, cubature_count=192), 150
+BUILD, SAMPLES = BuildOptions(mode_count=5, cubature_count=192), 400
 PRESETS = "bread mug banana fish doughnut ball block-a block-b block-c sponge bear cushion glove".split()
 SIZE, SMALL = 0.085, {"doughnut": 0.07, "ball": 0.055, "block-a": 0.048, "block-b": 0.048, "block-c": 0.048}
 """Longest edge of a toy, and of those that are thick [m]."""
@@ -54,8 +54,8 @@ def make_scene(own: list[str | ObjectConfig], seed: int, size: int, device: str 
     eye, target = (0.27, -0.20, 0.58), (0.0, 0.0, 0.06)
     camera = PinholeCamera.look_at("film", position=eye, target=target, width=size, height=size, fov_y=0.72)
     light = CameraOptions(mesh_samples=4, splat_shadow=ShadowOptions(cells=160))
-    many = SolverReducedOptions(contact_max=512)
-    return SplatScene(world, placed, cameras=[camera], options=many, camera_options=light, device=device)
+    fine = {"dt": 1.0 / 360.0, "steps_per_frame": 12, "options": SolverReducedOptions(contact_max=512)}
+    return SplatScene(world, placed, cameras=[camera], camera_options=light, device=device, **fine)
 
 
 def depth_in_walls(scene: SplatScene) -> float:

@@ -261,6 +261,27 @@ def beside(samples: Samples, pairs: Pairs, x: wp.vec3d, j: int, row: int, centre
 
 
 @wp.func
+def is_nearer(samples: Samples, pairs: Pairs, i: int, s: int, j: int, row: int, depth: wp.float64):
+    """Return whether a face of j that sample s of i does not look at is nearer to it than half of a depth.
+
+    The sample then pushes along that face at most: those of its own body that look at the face do.
+    """
+    x = samples.position[i, s]
+    reach = LATERAL * wp.float64(pairs.spacing[j])
+    found = bool(False)
+    for k in range(NEIGHBOURS):
+        t = pairs.neighbour[row, k]
+        if t < 0:
+            break
+        away = x - samples.position[j, t]
+        height = wp.dot(wp.vec3d(pairs.surface_normal[j, t]), away)
+        aside = wp.length_sq(away) - height * height
+        if wp.float64(2.0) * wp.abs(height) < depth and aside < reach * reach and not looks_at(pairs, i, s, j, t):
+            found = True
+    return found
+
+
+@wp.func
 def is_inside(instances: Instances, basis: Basis, samples: Samples, pairs: Pairs, x: wp.vec3d, j: int):
     """Return whether x lies in instance j by the winding number of its samples, sum A_k n_k . r_k / (4 pi r_k^3)."""
     total = wp.float64(0.0)
@@ -324,7 +345,7 @@ def fit_patch(
     elif beside(samples, pairs, x, j, row, x - offset, patch.normal):
         patch.total = wp.float64(0.0)
     elif j != i and patch.gap < wp.float64(-0.5) * wp.min(wp.float64(pairs.spacing[j]), wp.float64(wall)):
-        if not is_inside(instances, basis, samples, pairs, x, j):
+        if is_nearer(samples, pairs, i, s, j, row, -patch.gap) or not is_inside(instances, basis, samples, pairs, x, j):
             patch.total = wp.float64(0.0)
     return patch
 
