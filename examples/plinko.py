@@ -29,9 +29,9 @@ walls between the bins, half their thickness [m]."""
 WALLS, BETWEEN = (-0.15, 0.0, 0.15), (-0.225, -0.075, 0.075, 0.225)
 PEGS = np.array([(x, 0.32 + 0.12 * row) for row in range(4) for x in (WALLS if row % 2 else BETWEEN)])
 """Centres (x, z) of the pegs [m], over the walls and between them."""
-SMALL = {"doughnut": 0.06, "ball": 0.055, "block-a": 0.045, "block-b": 0.045, "block-c": 0.045}
-"""Longest edges of those that are thick [m]."""
-BUILD, SAMPLES, SIZE = BuildOptions(mode_count=5, cubature_count=192), 400, 0.075
+SMALL = {"cable": 0.05, "doughnut": 0.06, "ball": 0.055, "block-a": 0.045, "block-b": 0.045, "block-c": 0.045}
+"""Longest edges of those that are thick, and of the cable, which else hooks a peg [m]."""
+BUILD, SAMPLES, SIZE = BuildOptions(mode_count=5, cubature_count=192), 300, 0.075
 TOYS = [(name, SMALL.get(name, SIZE), 1.0) for name in PRESETS]
 TOYS += [("bear", 0.055, 4.0), ("doughnut", 0.05, 8.0), ("cushion", 0.06, 3.0)]
 """Each toy, its longest edge [m], and how many times as stiff as its preset it is."""
@@ -85,7 +85,7 @@ def make_scene(own: list[str | ObjectConfig], seed: int, height: int, device: st
     eye, target, width = (0.18, -1.6, 0.75), (0.0, 0.0, 0.54), height // 40 * 24
     camera = PinholeCamera.look_at("film", position=eye, target=target, width=width, height=height, fov_y=0.70)
     light = CameraOptions(light_direction=(-0.2, 0.7, -0.7), mesh_samples=4, splat_shadow=ShadowOptions(cells=200))
-    many = SolverReducedOptions(contact_max=512)
+    many = SolverReducedOptions(contact_max=768)
     return SplatScene(world, placed, cameras=[camera], options=many, camera_options=light, device=device)
 
 
