@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import warnings
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -89,9 +88,6 @@ class MaterialField:
     def missed(self, places: Array, weights: Array) -> float:
         """Return the share of places (M, 3), by their volumes (M,), that lie beyond all points.
 
-        Warns:
-            RuntimeWarning: If there are some.
-
         Raises:
             MaterialError: If they are more than a third.
         """
@@ -105,9 +101,6 @@ class MaterialField:
                 f"{self.name}: its points miss {100.0 * share:.0f} % of the object, which fills {low} to {high} m",
                 hint="give points where the object stands: z up, centred over the origin, standing on z = 0, in metres",
             )
-        if share > 1.0e-3:
-            text = f"{self.name}: its points miss {100.0 * share:.1f} % of the object: the nearest ones stand for it"
-            warnings.warn(text, RuntimeWarning, stacklevel=2)
         return share
 
 

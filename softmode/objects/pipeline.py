@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 import zlib
 from base64 import b85decode, b85encode
 from collections.abc import Sequence
@@ -35,6 +36,8 @@ Array = NDArray[np.float64]
 
 RECIPE = 9
 """Part of the cache key; raise it when the way from a file or shape to a body changes."""
+MISSED_LEAST = 1.0e-3
+"""Share of an object that a field of material misses from which on that is said."""
 SIZE_TOLERANCE = 0.005
 """Relative error of the size of a fill that is left. Splats tell a size less well than their fill does: few of them lie
 at a tip, such as the handle of a mug (1.3 % of its size), and floaters lie beyond it."""
@@ -156,10 +159,10 @@ def build_standing(
         wide = float("inf")
         top = float(seat[2]) + config.clamped_height
         held.append(Region(name="foot", box=((-wide,) * 3, (wide, wide, top))))
-    field, places, options = None, quadrature.points - seat, config.build
+    field, places, options, missed = None, quadrature.points - seat, config.build, 0.0
     if config.material_file is not None:
         field = read_material(config.material_file)
-        field.missed(places, quadrature.weights)
+        missed = field.missed(places, quadrature.weights)
     ratio = None if field is None else field.at("poissons_ratio", places)
     if field is not None and ratio is not None:
         options = replace(options, poissons_ratio=field.means["poissons_ratio"])  # to which the field is relative
@@ -176,6 +179,8 @@ def build_standing(
     frame: dict[str, str | float] = {}
     if field is not None and (density := field.at("density", places)) is not None:
         frame["field_density"] = float(quadrature.weights @ density / quadrature.volume)
+    if missed > MISSED_LEAST:
+        frame["field_missed"] = missed
     frame |= {"turn": json.dumps(turn.tolist()), "seat": json.dumps(seat.tolist())}
     if "part_splats" in source.capture and quadrature.members is not None:
         frame["shown"] = b85encode(zlib.compress(np.packbits(quadrature.members).tobytes())).decode()
@@ -187,6 +192,9 @@ def dressed(body: ReducedBody, config: ObjectConfig, source: ObjectSource, mater
 
     Splats of a capture without solid under them are left out, as is what lies beyond an eighth of the body's size
     around its bounding box.
+
+    Warns:
+        RuntimeWarning: If its material file misses a part of it.
     """
     turn = np.array(json.loads(str(body.provenance["turn"])))
     splats = _laid_down(source.splats, turn)
@@ -217,6 +225,12 @@ def dressed(body: ReducedBody, config: ObjectConfig, source: ObjectSource, mater
         mean = replace(own, density=float(body.provenance.get("field_density", own.density)))
         material = mean if material == own else material
         told["material"] = json.dumps({name: getattr(mean, name) for name in (*PROPERTIES, "friction")})
+    notes = source.notes
+    if (missed := body.provenance.get("field_missed")) is not None:
+        file = Path(str(config.material_file)).name
+        text = f"{file} misses {100.0 * float(missed):.1f} % of the object: its nearest points stand for what is there"
+        warnings.warn(text, RuntimeWarning, stacklevel=3)
+        notes = (*notes, text)
     factor, field = float(np.cbrt(np.linalg.det(turn))), source.radiance
     if source.field_pose is not None:
         laid = pose_of(turn, -body.offset) @ source.field_pose
@@ -228,7 +242,7 @@ def dressed(body: ReducedBody, config: ObjectConfig, source: ObjectSource, mater
         contact_radius=config.contact_radius,
         config=config,
         radiance=None if field is None else field.transformed(turn / factor, -body.offset, factor),
-        notes=source.notes,
+        notes=notes,
     )
 
 

@@ -162,7 +162,7 @@ def test_an_object_by_a_material_field(tmp_path) -> None:
     share = given.quadrature.weights @ given.density_scale / given.quadrature.volume
     np.testing.assert_allclose(made.density * given.density_scale[high] / share, 600.0)
     sparse = base.changed(material_file=written(points=points * (1.0, 1.0, 0.8)))
-    with pytest.warns(RuntimeWarning, match="miss .* % of the object"):
+    with pytest.warns(RuntimeWarning, match="misses .* % of the object"):
         load(sparse)
     bad = {
         "one for each": {"density": np.ones(3)},
