@@ -51,7 +51,7 @@ def make_scene(own: list[str | ObjectConfig], seed: int, size: int, device: str 
         place = (*LAYER[cell], 0.17 + 0.14 * layer + (0.06 if cell == 0 else 0.0))
         turn = Rotation.from_quat(rng.normal(size=4)).as_matrix()
         placed.append(Placed(object=replace(thing, material=thing.material or PLUSH), position=place, rotation=turn))
-    eye, target = (0.27, -0.20, 0.58), (0.0, 0.0, 0.06)
+    eye, target = (0.31, -0.23, 0.64), (0.0, 0.0, 0.09)
     camera = PinholeCamera.look_at("film", position=eye, target=target, width=size, height=size, fov_y=0.72)
     light = CameraOptions(mesh_samples=4, splat_shadow=ShadowOptions(cells=160))
     fine = {"dt": 1.0 / 360.0, "steps_per_frame": 12, "options": SolverReducedOptions(contact_max=512)}

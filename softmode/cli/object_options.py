@@ -56,9 +56,9 @@ class ObjectOptions:
     density_by_color: tuple[str, ...] = ()
     """'#rrggbb:FACTOR': what has this colour is FACTOR times as dense as the rest; the mass stays."""
     density_file: Path | None = None
-    """.npz of points [m] where the object stands, and factors of density."""
+    """.npz of points and factors of density."""
     material_file: Path | None = None
-    """.npz of points [m] where the object stands, with youngs_modulus, poissons_ratio, density there."""
+    """.npz or stage of points with E, nu, density."""
 
     def check(self) -> None:
         """Refuse what cannot be, before any work is done.

@@ -222,7 +222,7 @@ def dressed(body: ReducedBody, config: ObjectConfig, source: ObjectSource, mater
         told["material"] = json.dumps(find_preset(config.preset).properties)
     if config.material_file is not None and (own := config.material) is not None:
         # The mean over the solid, so that its mass is that of the field.
-        mean = replace(own, density=float(body.provenance.get("field_density", own.density)))
+        mean = replace(own, density=float(body.provenance.get("field_density") or own.density))
         material = mean if material == own else material
         told["material"] = json.dumps({name: getattr(mean, name) for name in (*PROPERTIES, "friction")})
     notes = source.notes

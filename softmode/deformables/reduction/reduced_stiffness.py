@@ -36,8 +36,7 @@ def reduced_stiffness(gradient: Array, weights: Array, poissons_ratio: float, la
     def products(weight: Array) -> Array:
         return ((flat * weight) @ flat.T).reshape(3, count, 3, count)
 
-    varies = lame_ratio is not None and len(lame_ratio)
-    volume = products(weights * lame_ratio) if varies else None
+    volume = None if lame_ratio is None or not len(lame_ratio) else products(weights * lame_ratio)
     return elastic_stiffness(products(weights), poissons_ratio, volume)
 
 
