@@ -31,9 +31,9 @@ PEGS = np.array([(x, 0.32 + 0.12 * row) for row in range(4) for x in (WALLS if r
 """Centres (x, z) of the pegs [m], over the walls and between them."""
 SMALL = {"cable": 0.05, "doughnut": 0.06, "ball": 0.055, "block-a": 0.045, "block-b": 0.045, "block-c": 0.045}
 """Longest edges of those that are thick, and of the cable, which else hooks a peg [m]."""
-BUILD, SAMPLES, SIZE = BuildOptions(mode_count=5, cubature_count=192), 300, 0.075
+BUILD, SAMPLES, SIZE = BuildOptions(mode_count=5, cubature_count=192), 300, 0.065
 TOYS = [(name, SMALL.get(name, SIZE), 1.0) for name in PRESETS]
-TOYS += [("bear", 0.055, 4.0), ("doughnut", 0.05, 8.0), ("cushion", 0.06, 3.0)]
+TOYS += [("bear", 0.055, 4.0), ("doughnut", 0.05, 8.0), ("cushion", 0.055, 3.0)]
 """Each toy, its longest edge [m], and how many times as stiff as its preset it is."""
 PLUSH = Material(youngs_modulus=5.0e4, poissons_ratio=0.35, density=150.0)
 """What captures are made of."""
@@ -85,8 +85,8 @@ def make_scene(own: list[str | ObjectConfig], seed: int, height: int, device: st
     eye, target, width = (0.18, -1.6, 0.75), (0.0, 0.0, 0.54), height // 40 * 24
     camera = PinholeCamera.look_at("film", position=eye, target=target, width=width, height=height, fov_y=0.70)
     light = CameraOptions(light_direction=(-0.2, 0.7, -0.7), mesh_samples=4, splat_shadow=ShadowOptions(cells=200))
-    many = SolverReducedOptions(contact_max=768)
-    return SplatScene(world, placed, cameras=[camera], options=many, camera_options=light, device=device)
+    fine = {"dt": 1.0 / 360.0, "steps_per_frame": 12, "options": SolverReducedOptions(contact_max=768)}
+    return SplatScene(world, placed, cameras=[camera], camera_options=light, device=device, **fine)
 
 
 def depth_in_board(scene: SplatScene) -> float:
