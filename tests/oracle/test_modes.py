@@ -76,7 +76,8 @@ def test_eighty_functions(name: str, poissons_ratio: float) -> None:
     assert -0.01 < low and high < 0.02
 
 
-@pytest.mark.parametrize("name", rest_but(["bar, along"], CASES))
+@pytest.mark.rest
+@pytest.mark.parametrize("name", CASES)
 def test_two_moduli(name: str) -> None:
     """A jump of ten times, in no relation to the grid, costs 6 % at most in the first six frequencies."""
     size, axis, jump = CASES[name]
