@@ -30,7 +30,7 @@ WALLS, BETWEEN = (-0.15, 0.0, 0.15), (-0.225, -0.075, 0.075, 0.225)
 PEGS = np.array([(x, 0.32 + 0.12 * row) for row in range(4) for x in (WALLS if row % 2 else BETWEEN)])
 """Centres (x, z) of the pegs [m], over the walls and between them."""
 SMALL = {"cable": 0.04, "doughnut": 0.06, "ball": 0.055, "block-a": 0.045, "block-b": 0.045, "block-c": 0.045}
-"""Longest edges of those that are thick, and of the cable, which else hooks a peg [m]."""
+"""Longest edges of those that are thick, and of the cable, which may hook a peg [m]."""
 BUILD, SAMPLES, SIZE = BuildOptions(mode_count=5, cubature_count=192), 300, 0.065
 TOYS = [(name, SMALL.get(name, SIZE), 1.0) for name in PRESETS]
 TOYS += [("bear", 0.055, 4.0), ("doughnut", 0.05, 8.0), ("cushion", 0.055, 3.0)]
