@@ -384,6 +384,7 @@ class Surface:
             beside
             or (blade and np.linalg.norm(mean) < 0.95)
             or self._beyond_edge(x, x - offset, normal, around & (distance < 2.0 * self.spacing))
+            or (gap < -0.5 * self.spacing and self._is_elsewhere(x, around & (facing <= 0.3), -gap))
         ):
             return None
         return gap, normal, w, nearest
@@ -402,6 +403,16 @@ class Surface:
         across = (np.abs(self.normals @ normal) < 0.5) & close
         below = (self.points - centre) @ normal < 0.0
         return bool((across & below & (height(x) > 0.0) & (height(centre) < 0.0)).any())
+
+    def _is_elsewhere(self, x: np.ndarray, faces: np.ndarray, depth: float) -> bool:
+        """Return whether one of some faces is nearer to x than half of a depth, or x is outside; of a thick body."""
+        away = self.points - x
+        height, square = np.einsum("sc,sc->s", self.normals, away), (away**2).sum(axis=1)
+        aside = np.sqrt(np.maximum(square - height**2, 0.0))
+        nearer = faces & (2.0 * np.abs(height) < depth) & (aside < 1.2 * self.spacing)
+        areas = self.body.surface.areas
+        winding = (areas * height / (square + 0.1 * areas) ** 1.5).sum() / (4.0 * np.pi)
+        return bool(nearer.any() or winding <= 0.4)
 
     def touched_row(self, x: np.ndarray, patch: tuple[float, np.ndarray, np.ndarray, int]) -> np.ndarray:
         """Return the functions (n,) of the material at x - max(gap, 0) normal, carried there from the samples."""

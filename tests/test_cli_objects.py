@@ -210,6 +210,7 @@ CHOSEN: dict[str, tuple[Any, dict[str, Any]]] = {
     "stiffness_file": (Path("stiff.npz"), {"stiffness_file": Path("stiff.npz")}),
     "density_by_color": (("#0000ff:2",), {"density_colors": (StifferColor(color=(0.0, 0.0, 1.0), factor=2.0),)}),
     "density_file": (Path("dense.npz"), {"density_file": Path("dense.npz")}),
+    "material_file": (Path("made.npz"), {"material_file": Path("made.npz")}),
 }
 """A value of every option, and what it becomes in `ObjectConfig`; a splat file goes before a preset here."""
 
@@ -278,7 +279,7 @@ def test_every_option_reaches_the_object() -> None:
         (
             ObjectConfig(body="toy.npz"),
             "size up crop part pose resolution stiffness stiffness_by_color stiffness_file density_by_color "
-            "density_file",
+            "density_file material_file",
         ),
     ],
     ids=["splats", "mesh", "preset", "field", "shape", "body"],

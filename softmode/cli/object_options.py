@@ -56,7 +56,9 @@ class ObjectOptions:
     density_by_color: tuple[str, ...] = ()
     """'#rrggbb:FACTOR': what has this colour is FACTOR times as dense as the rest; the mass stays."""
     density_file: Path | None = None
-    """.npz of points [m] where the object stands, and factors of density."""
+    """.npz of points and factors of density."""
+    material_file: Path | None = None
+    """.npz or stage of points with E, nu, density."""
 
     def check(self) -> None:
         """Refuse what cannot be, before any work is done.
@@ -94,7 +96,7 @@ class ObjectOptions:
     @property
     def shape(self) -> dict[str, Any]:
         """The options that say how a file becomes an object, as fields of `ObjectConfig`."""
-        names = ("size", "up", "crop", "part", "pose", "resolution", "stiffness_file", "density_file")
+        names = ("size", "up", "crop", "part", "pose", "resolution", "stiffness_file", "density_file", "material_file")
         given = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
         given |= {"march": True} if self.march else {}
         if self.stiffness:
@@ -150,6 +152,7 @@ class ObjectOptions:
             AssetError: If the file is missing or cannot be read.
             ConfigError: If an option says nothing about this object, or the task cannot have it.
         """
+        from softmode.objects.material_field import read_material
         from softmode.objects.object_file import read_object, stored_material
         from softmode.objects.shapes.presets import find_preset
 
@@ -157,6 +160,8 @@ class ObjectOptions:
         stored = {} if thing.body is None else stored_material(read_object(thing.body).body)
         if thing.preset is not None:
             stored = find_preset(thing.preset).properties
+        if thing.material_file is not None:
+            stored = {**stored, **read_material(thing.material_file).means}
         made = {**stored, **self.material}
         material = dataclasses.replace(config.scene.material, **made)
         scene = dataclasses.replace(config.scene, object=thing, material=material)

@@ -163,17 +163,17 @@ def particles_from_body(
 
     Raises:
         AssetError: If no particle lies inside.
-        ConfigError: If the body does not keep its quadrature points, or their density was painted.
+        ConfigError: If the body does not keep its quadrature points, or their material varies.
     """
     made = material or Material()
     if spacing is None:
-        from softmode.deformables.reduction.sources import unpack_sources
+        from softmode.deformables.reduction.sources import FIELDS, unpack_sources
 
         sources = unpack_sources(body)
-        if sources.density_scale is not None:
+        if any(getattr(sources, name) is not None for name in FIELDS):
             raise ConfigError(
-                f"body {body.name!r}: its density was painted, particles of a body have one density",
-                hint="give a spacing, or build the body without density_scale",
+                f"body {body.name!r}: its material varies, particles of a body have one material",
+                hint="give a spacing, or build the body without fields",
             )
         points, volumes = sources.quadrature.points - body.offset, sources.quadrature.weights
         return ParticleBody(positions=points, masses=made.density * volumes, material=made)

@@ -15,6 +15,7 @@ from softmode.deformables.reduction.options import BuildOptions
 from softmode.errors import AssetError, ConfigError
 from softmode.objects.captures import bundled
 from softmode.objects.fingerprint import file_fingerprint, find_file
+from softmode.objects.material_field import read_material
 from softmode.objects.paint import StifferColor
 from softmode.objects.parts import Part, Rule
 from softmode.objects.shapes.presets import find_preset
@@ -28,12 +29,12 @@ Shape = Literal["plush", "box", "cylinder", "capsule", "sphere"]
 Pose = Literal["stable", "captured"]
 SIZE = 0.08
 """Longest edge of what has no size of its own and is given none [m]."""
-PAINTED = ("stiffness", "stiffness_colors", "stiffness_file", "density_colors", "density_file")
-"""Options that say where stiffness and density vary."""
+PAINTED = ("stiffness", "stiffness_colors", "stiffness_file", "density_colors", "density_file", "material_file")
+"""Options that say where the material varies."""
 FILES = ("splat", "mesh", "radiance", "body")
 """Options that name a file."""
-FIELD_FILES = {"stiffness_file": "stiffness_fingerprint", "density_file": "density_fingerprint"}
-"""Options that name a file of factors, and those that hold its fingerprint."""
+FIELD_FILES = {f"{name}_file": f"{name}_fingerprint" for name in ("stiffness", "density", "material")}
+"""Options that name a file of factors or of properties, and those that hold its fingerprint."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,6 +122,9 @@ class ObjectConfig:
     of the material's density."""
     density_file: str | Path | None = None
     """File of points and factors of density, likewise; times what `density_colors` says."""
+    material_file: str | Path | None = None
+    """File of points with Young's modulus, Poisson's ratio and density, as `read_material` takes, where the object
+    stands; the options above come on top as factors."""
     clamped_height: float = 0.0
     """Height of the foot that is fixed to the table [m], 0 for an object that stands free. A clamped object keeps its
     scale."""
@@ -133,6 +137,8 @@ class ObjectConfig:
     """The same for `stiffness_file`."""
     density_fingerprint: str | None = None
     """The same for `density_file`."""
+    material_fingerprint: str | None = None
+    """The same for `material_file`."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -200,8 +206,11 @@ class ObjectConfig:
 
     @property
     def material(self) -> Material | None:
-        """What a preset is made of; None for anything else."""
-        return None if self.preset is None else find_preset(self.preset).material
+        """What a preset, or an object with a file of its material, is made of; None for anything else."""
+        found = None if self.preset is None else find_preset(self.preset).material
+        if self.material_file is None:
+            return found
+        return replace(found or Material(), **read_material(self.material_file).means)
 
     def for_material(self, material: Material | None) -> ObjectConfig:
         """Return this with a body for a material's own Poisson's ratio, unless its options name one."""

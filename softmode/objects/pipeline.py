@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 import zlib
 from base64 import b85decode, b85encode
 from collections.abc import Sequence
@@ -21,6 +22,7 @@ from softmode.deformables.quadrature.surface_samples import SURFACE_COUNT
 from softmode.deformables.reduction.build_body import Progress, build_body
 from softmode.errors import AssetError, ConfigError
 from softmode.objects.config import FIELD_FILES, FILES, ObjectConfig
+from softmode.objects.material_field import PROPERTIES, MaterialField, read_material
 from softmode.objects.paint import color_field, read_field
 from softmode.objects.pose import seat_of, stable_rotation
 from softmode.objects.shapes.presets import find_preset
@@ -34,6 +36,8 @@ Array = NDArray[np.float64]
 
 RECIPE = 9
 """Part of the cache key; raise it when the way from a file or shape to a body changes."""
+MISSED_LEAST = 1.0e-3
+"""Share of an object that a field of material misses from which on that is said."""
 SIZE_TOLERANCE = 0.005
 """Relative error of the size of a fill that is left. Splats tell a size less well than their fill does: few of them lie
 at a tip, such as the handle of a mug (1.3 % of its size), and floaters lie beyond it."""
@@ -91,7 +95,11 @@ def standing_quadrature(config: ObjectConfig, source: ObjectSource) -> tuple[Qua
 
 
 def relative_scale(
-    config: ObjectConfig, name: Literal["stiffness", "density"], quadrature: Quadrature, splats: Splats
+    config: ObjectConfig,
+    name: Literal["stiffness", "density"],
+    quadrature: Quadrature,
+    splats: Splats,
+    field: MaterialField | None = None,
 ) -> Array | None:
     """Return the relative stiffness or density per quadrature point (P,), None if it is the same everywhere.
 
@@ -100,6 +108,7 @@ def relative_scale(
         name: Which of the two.
         quadrature: Its solid, as it stands.
         splats: What shows it there.
+        field: What its material file says.
 
     Raises:
         AssetError: If a file cannot be read.
@@ -107,9 +116,11 @@ def relative_scale(
     """
     boxes = config.stiffness if name == "stiffness" else ()
     colors, file = getattr(config, f"{name}_colors"), getattr(config, f"{name}_file")
-    if not boxes and not colors and file is None:
-        return None
     points = quadrature.points - seat_of(quadrature.bounds)
+    own = "youngs_modulus" if name == "stiffness" else name
+    absolute = None if field is None else field.at(own, points)
+    if not boxes and not colors and file is None and absolute is None:
+        return None
     found = np.ones(len(points))
     for part in boxes:
         inside = (points >= part.box[:3]).all(axis=1) & (points <= part.box[3:]).all(axis=1)
@@ -123,7 +134,7 @@ def relative_scale(
         found *= color_field(splats, colors)(quadrature.points)
     if file is not None:
         found *= read_field(file)(points)
-    return found
+    return found if field is None or absolute is None else found * (absolute / field.means[own])
 
 
 def build_standing(
@@ -148,16 +159,29 @@ def build_standing(
         wide = float("inf")
         top = float(seat[2]) + config.clamped_height
         held.append(Region(name="foot", box=((-wide,) * 3, (wide, wide, top))))
+    field, places, options, missed = None, quadrature.points - seat, config.build, 0.0
+    if config.material_file is not None:
+        field = read_material(config.material_file)
+        missed = field.missed(places, quadrature.weights)
+    ratio = None if field is None else field.at("poissons_ratio", places)
+    if field is not None and ratio is not None:
+        options = replace(options, poissons_ratio=field.means["poissons_ratio"])  # to which the field is relative
     body = build_body(
         quadrature,
-        config.build,
+        options,
         name=source.name,
         regions=held,
-        stiffness_scale=relative_scale(config, "stiffness", quadrature, splats),
-        density_scale=relative_scale(config, "density", quadrature, splats),
+        stiffness_scale=relative_scale(config, "stiffness", quadrature, splats, field),
+        density_scale=relative_scale(config, "density", quadrature, splats, field),
+        poissons_ratio=ratio,
         progress=progress,
     )
-    frame = {"turn": json.dumps(turn.tolist()), "seat": json.dumps(seat.tolist())}
+    frame: dict[str, str | float] = {}
+    if field is not None and (density := field.at("density", places)) is not None:
+        frame["field_density"] = float(quadrature.weights @ density / quadrature.volume)
+    if missed > MISSED_LEAST:
+        frame["field_missed"] = missed
+    frame |= {"turn": json.dumps(turn.tolist()), "seat": json.dumps(seat.tolist())}
     if "part_splats" in source.capture and quadrature.members is not None:
         frame["shown"] = b85encode(zlib.compress(np.packbits(quadrature.members).tobytes())).decode()
     return replace(body, provenance={**body.provenance, **frame}), quadrature
@@ -168,6 +192,9 @@ def dressed(body: ReducedBody, config: ObjectConfig, source: ObjectSource, mater
 
     Splats of a capture without solid under them are left out, as is what lies beyond an eighth of the body's size
     around its bounding box.
+
+    Warns:
+        RuntimeWarning: If its material file misses a part of it.
     """
     turn = np.array(json.loads(str(body.provenance["turn"])))
     splats = _laid_down(source.splats, turn)
@@ -193,6 +220,17 @@ def dressed(body: ReducedBody, config: ObjectConfig, source: ObjectSource, mater
         told["asset_notes"] = "; ".join(source.notes)
     if config.preset is not None:
         told["material"] = json.dumps(find_preset(config.preset).properties)
+    if config.material_file is not None and (own := config.material) is not None:
+        # The mean over the solid, so that its mass is that of the field.
+        mean = replace(own, density=float(body.provenance.get("field_density") or own.density))
+        material = mean if material == own else material
+        told["material"] = json.dumps({name: getattr(mean, name) for name in (*PROPERTIES, "friction")})
+    notes = source.notes
+    if (missed := body.provenance.get("field_missed")) is not None:
+        file = Path(str(config.material_file)).name
+        text = f"{file} misses {100.0 * float(missed):.1f} % of the object: its nearest points stand for what is there"
+        warnings.warn(text, RuntimeWarning, stacklevel=3)
+        notes = (*notes, text)
     factor, field = float(np.cbrt(np.linalg.det(turn))), source.radiance
     if source.field_pose is not None:
         laid = pose_of(turn, -body.offset) @ source.field_pose
@@ -204,7 +242,7 @@ def dressed(body: ReducedBody, config: ObjectConfig, source: ObjectSource, mater
         contact_radius=config.contact_radius,
         config=config,
         radiance=None if field is None else field.transformed(turn / factor, -body.offset, factor),
-        notes=source.notes,
+        notes=notes,
     )
 
 

@@ -30,12 +30,12 @@ def exchangeable(body: ReducedBody) -> bool:
 
 def material_values(body: ReducedBody, material: Material) -> dict[str, Any]:
     """Return what `KaolinPhysicsMaterialAPI` says: points [m], E [Pa], nu, density [kg/m^3] and the volume [m^3]."""
-    count = body.point_count
+    moduli, ratios = body.cubature.moduli(material.youngs_modulus, material.poissons_ratio)
     return {
         "pts": body.cubature.points.astype(np.float32),
-        "yms": (material.youngs_modulus * body.cubature.stiffness_scale).astype(np.float32),
-        "prs": np.full(count, material.poissons_ratio, np.float32),
-        "rhos": np.full(count, material.density, np.float32),
+        "yms": moduli.astype(np.float32),
+        "prs": ratios.astype(np.float32),
+        "rhos": np.full(body.point_count, material.density, np.float32),
         "appx_vol": float(body.volume),
     }
 
@@ -51,7 +51,8 @@ def skinned_values(body: ReducedBody, material: Material, splat_weights: NDArray
     weight, gradient = handle_weights(body, body.cubature.points)
     share = body.cubature.weights * (body.point_count / body.volume)
     values = material_values(body, material)
-    values["yms"] = (material.youngs_modulus * body.cubature.stiffness_scale * share).astype(np.float32)
+    moduli, _ratios = body.cubature.moduli(material.youngs_modulus, material.poissons_ratio)
+    values["yms"] = (moduli * share).astype(np.float32)
     values["rhos"] = (material.density * share).astype(np.float32)
     values["skinning_weights"] = weight.astype(np.float32)
     values["dwdx"] = gradient.astype(np.float32)

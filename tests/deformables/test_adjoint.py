@@ -233,6 +233,18 @@ def test_field_of_moduli():
     assert field[half].sum() == pytest.approx(slope, rel=10 * h**2)
 
 
+def test_field_of_ratios():
+    """DL/dE and dL/dnu predict what a change does to a body whose lambda / mu varies."""
+    case = hanging()
+    ratio = case.scene.reduced.view.basis.lame_ratio
+    ratio.assign(np.where(case.body.cubature.points[:, 0] > 0.0, 3.0, 0.3))
+    gradients = case.gradients()
+    found = {name: gradients[name][0] for name in ("youngs_modulus", "poissons_ratio")}
+    expected = {name: case.parameter_difference(name) for name in found}
+    ratio.fill_(1.0)
+    assert found == pytest.approx(expected, rel=ACCURACY)
+
+
 def test_marker_loss():
     """The loss of tracked points: Markers.spread is the transpose of Markers.positions."""
     case, rng = hanging(), np.random.default_rng(3)

@@ -66,12 +66,16 @@ def default(request) -> tuple[Quadrature, ReducedBody]:
     return found, build_body(found)
 
 
-FIELDS = {"stiffness_scale": lambda X: 2.0 + X[:, 0], "density_scale": lambda X: 1.0 + 1e3 * X[:, 2] ** 2 + X[:, 2]}
+FIELDS = {
+    "stiffness_scale": lambda X: 2.0 + X[:, 0],
+    "density_scale": lambda X: 1.0 + 1e3 * X[:, 2] ** 2 + X[:, 2],
+    "poissons_ratio": lambda X: np.clip(0.3 + 3.0 * X[:, 2], 0.0, 0.49),
+}
 
 
 @pytest.fixture(scope="module")
 def uneven(quadrature: Quadrature) -> ReducedBody:
-    """Return the capsule with a modulus and a density that vary."""
+    """Return the capsule with a modulus, a density and a Poisson's ratio that vary."""
     return build_body(quadrature, SMALL, **FIELDS)
 
 
@@ -180,11 +184,19 @@ def test_density_moves_the_frame(uneven: ReducedBody, quadrature: Quadrature) ->
     np.testing.assert_allclose(mass @ value, body.mean_basis, atol=1e-10)
 
 
-def test_stiffness_field_reaches_the_points(uneven: ReducedBody, quadrature: Quadrature) -> None:
-    """Cubature points carry the relative modulus of the quadrature point they are."""
-    body, stiff = uneven, FIELDS["stiffness_scale"](quadrature.points)
+def test_fields_reach_the_points(uneven: ReducedBody, quadrature: Quadrature, tmp_path: Path) -> None:
+    """Cubature points have the modulus and the Poisson's ratio of the quadrature point they are, and a file keeps them.
+
+    Where the ratio varies, what is stored is relative to the ratio of the options.
+    """
+    uneven.save(tmp_path / "uneven.npz")
+    body, stiff = ReducedBody.load(tmp_path / "uneven.npz"), FIELDS["stiffness_scale"](quadrature.points)
     index = np.array([np.abs(quadrature.points - body.offset - p).sum(axis=1).argmin() for p in body.cubature.points])
-    np.testing.assert_array_equal(body.cubature.stiffness_scale, stiff[index])
+    modulus, ratio = body.cubature.moduli(1.0, SMALL.poissons_ratios[0])
+    np.testing.assert_allclose(modulus, stiff[index], rtol=1e-14)
+    np.testing.assert_allclose(ratio, FIELDS["poissons_ratio"](quadrature.points)[index], rtol=1e-13, atol=1e-15)
+    wide = body.cubature.moduli(1.0, 0.49)[1]
+    assert wide.max() < 0.5 and (wide >= ratio).all()
 
 
 def test_fields_may_be_functions_of_position(uneven: ReducedBody, quadrature: Quadrature) -> None:
@@ -197,11 +209,13 @@ def test_fields_may_be_functions_of_position(uneven: ReducedBody, quadrature: Qu
             build_body(quadrature, SMALL, stiffness_scale=wrong)
 
 
-@pytest.mark.parametrize("field", ["stiffness_scale", "density_scale"])
-@pytest.mark.parametrize("bad", [0.0, -1.0, np.nan, np.inf])
+BAD = {"stiffness_scale": (0.0, -1.0, np.nan, np.inf), "poissons_ratio": (0.5, -0.1, np.nan)}
+
+
+@pytest.mark.parametrize(("field", "bad"), [(field, bad) for field, bads in BAD.items() for bad in bads])
 def test_bad_fields_are_refused(quadrature: Quadrature, field: str, bad: float) -> None:
-    """Zero, negative, NaN and infinite scales raise MaterialError naming the field and the row."""
-    value = np.ones(len(quadrature.points))
+    """Zero, negative, NaN and infinite scales, and ratios out of range, raise MaterialError naming field and row."""
+    value = np.full(len(quadrature.points), 0.3)
     value[7] = bad
     with pytest.raises(MaterialError, match=f"{field}: .* at row 7"):
         build_body(quadrature, SMALL, **{field: value})

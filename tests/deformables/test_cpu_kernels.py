@@ -27,11 +27,12 @@ DOUBLE, SINGLE = 1.0e-12, 4.0e-7
 
 
 def pressed(mode_count: int, model: MaterialModel = MaterialModel.STABLE_NEO_HOOKEAN_LOG) -> Scene:
-    """Return a cube under a box at an iterate, of another scale than 1, with points of different stiffness."""
+    """Return a cube under a box at an iterate, of another scale than 1, with points of different moduli."""
     scene = loaded(mode_count)
     t = scene.reduced.tables
     points = t.layout.point_max
     t.basis.stiffness_scale.assign(np.linspace(0.5, 2.0, points))
+    t.basis.lame_ratio.assign(np.linspace(3.0, 0.2, points))
     t.instances.material_model.fill_(int(model))
     t.instances.viscosity.fill_(0.002)
     t.instances.scale.fill_(1.02)

@@ -40,9 +40,10 @@ def quadrature():
 
 @pytest.fixture(scope="module")
 def scales(quadrature):
-    """Relative moduli and densities of the bar."""
+    """Relative moduli, densities and Poisson's ratios of the bar."""
     x = quadrature.points[:, 0]
-    return {"stiffness_scale": np.where(x > 0.0, 4.0, 1.0), "density_scale": 1.0 + np.abs(x)}
+    ratio = np.where(x > 0.0, 0.45, 0.2)
+    return {"stiffness_scale": np.where(x > 0.0, 4.0, 1.0), "density_scale": 1.0 + np.abs(x), "poissons_ratio": ratio}
 
 
 @pytest.fixture(scope="module")

@@ -583,6 +583,13 @@ def test_far_side_does_not_push():
             assert normal[2] * (i - j) > 0.0
 
 
+def test_what_lies_behind_a_wall_is_not_in_it():
+    """The edge of a sheet is 3 mm inside the side of a cube: the cube's top, 10 mm above, is not deep in the sheet."""
+    scene = two(sheet(), cube(0.06), (0.06 - 0.003 + 0.03, 0.0, 0.008 - 0.03))
+    gaps = np.array([gap for _, _, _, gap, *_ in found(scene)])
+    assert gaps.min() == pytest.approx(-0.003, abs=2e-4) and (gaps < -0.0025).sum() >= 2
+
+
 def test_contact_radius():
     """Bodies at rest stand off by the sum of their radii, from the ground by their own."""
     radii = (0.002, 0.003)

@@ -263,7 +263,7 @@ def test_particles_of_a_mesh_and_of_a_body_have_its_mass() -> None:
     assert at_points.mass == pytest.approx(75.0 * quadrature.volume, rel=1e-12)
     assert np.abs(at_points.centre).max() < 1e-12
     painted = replace(unpack_sources(body), density_scale=np.linspace(0.5, 1.5, len(quadrature.points)))
-    with pytest.raises(ConfigError, match="painted"):
+    with pytest.raises(ConfigError, match="varies"):
         particles_from_body(replace(body, sources=pack_sources(painted)))
     with pytest.raises(ConfigError, match="does not keep"):
         particles_from_body(replace(body, sources=None))

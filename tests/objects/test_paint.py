@@ -15,7 +15,8 @@ from softmode.deformables import BuildOptions, ReducedBody, build_body, elastic_
 from softmode.deformables.reduction.reduced_stiffness import reduced_stiffness
 from softmode.deformables.reduction.sources import unpack_sources
 from softmode.errors import AssetError, ConfigError, MaterialError
-from softmode.objects import ObjectConfig, StifferColor, color_field, load, nearest_field, read_field
+from softmode.objects import ObjectConfig, StifferBox, StifferColor, color_field, load, nearest_field, read_field
+from softmode.objects.material_field import read_material
 from softmode.objects.paint import brushed
 from softmode.splats.point_cloud import splats_from_points
 
@@ -127,6 +128,73 @@ def test_an_object_by_files_and_density(tmp_path) -> None:
         load(base.changed(density_file=tmp_path / "none.npz"))
     with pytest.raises(ConfigError, match="density_file"):
         ObjectConfig(body="body.npz", density_file=tmp_path / "dense.npz")
+
+
+def test_an_object_by_a_material_field(tmp_path) -> None:
+    """E, nu and rho of a file are those of the body's points; a box is a factor on top; the mass is the field's.
+
+    Files that do not fit, values out of range, and points beside the object are refused.
+    """
+    steps = [np.linspace(-0.5 * s, 0.5 * s, 9) for s in SIZE]
+    points = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3) + np.array([0.0, 0.0, 0.5 * SIZE[2]])
+    upper = points[:, 2] > 0.5 * SIZE[2]
+    lower = {"youngs_modulus": 1e5, "poissons_ratio": 0.2, "density": 300.0}
+    values = {name: np.where(upper, 2.0 * value, value) for name, value in lower.items()}
+
+    def written(**changes: object) -> Path:
+        arrays = {"points": points, **values, **changes}
+        np.savez(tmp_path / "field.npz", **{name: array for name, array in arrays.items() if array is not None})
+        return tmp_path / "field.npz"
+
+    shape = {"shape": "box", "extents": SIZE, "splat_count": 800, "surface_count": 80, "build": OPTIONS}
+    wide = (*[-np.inf] * 3, *[np.inf] * 3)
+    base = ObjectConfig(**shape, stiffness=(StifferBox(box=wide, factor=3.0),))
+    thing = load(base.changed(material_file=written()))
+    given, made = unpack_sources(thing.body), thing.material
+    high = given.quadrature.points[:, 2] - given.quadrature.bounds[0, 2] > 0.58 * SIZE[2]  # beside the jump
+    low = given.quadrature.points[:, 2] - given.quadrature.bounds[0, 2] < 0.54 * SIZE[2]
+    assert made is not None and given.stiffness_scale is not None and given.poissons_ratio is not None
+    for where, factor in ((high, 2.0), (low, 1.0)):
+        np.testing.assert_allclose(made.youngs_modulus * given.stiffness_scale[where], factor * 3e5)
+        np.testing.assert_allclose(given.poissons_ratio[where], factor * 0.2)
+    assert made.poissons_ratio == pytest.approx(given.options.poissons_ratios[0])
+    assert given.density_scale is not None
+    share = given.quadrature.weights @ given.density_scale / given.quadrature.volume
+    np.testing.assert_allclose(made.density * given.density_scale[high] / share, 600.0)
+    sparse = base.changed(material_file=written(points=points * (1.0, 1.0, 0.8)))
+    with pytest.warns(RuntimeWarning, match="misses .* % of the object"):
+        load(sparse)
+    bad = {
+        "one for each": {"density": np.ones(3)},
+        "nu < 0.5": {"poissons_ratio": np.full(len(points), 0.5)},
+        "youngs_modulus: expected > 0": {"youngs_modulus": np.zeros(len(points))},
+        "finite": {"points": points * np.nan},
+        "no property": dict.fromkeys(values),
+        "miss": {"points": points + np.array([0.0, 0.0, 0.6 * SIZE[2]])},
+    }
+    for match, changes in bad.items():
+        with pytest.raises(MaterialError, match=match):
+            load(base.changed(material_file=written(**changes)))
+    with pytest.raises(AssetError, match="holds"):
+        load(base.changed(material_file=written(points=None)))
+
+
+def test_a_material_field_of_a_stage(tmp_path) -> None:
+    """`Points` prims with primvars: the stage's unit and up axis act on points, values are SI."""
+    Usd, UsdGeom, Sdf = (pytest.importorskip(f"pxr.{name}") for name in ("Usd", "UsdGeom", "Sdf"))
+    stage = Usd.Stage.CreateNew(str(tmp_path / "field.usda"))
+    UsdGeom.SetStageUpAxis(stage, "Y")
+    UsdGeom.SetStageMetersPerUnit(stage, 0.01)
+    prim = UsdGeom.Points.Define(stage, "/field")
+    prim.CreatePointsAttr([(1.0, 2.0, 3.0), (4.0, 5.0, 6.0)])
+    UsdGeom.Xformable(prim).AddTranslateOp().Set((0.0, 10.0, 0.0))
+    for name, values in (("youngsModulus", [1e4, 3e4]), ("density", [100.0, 300.0])):
+        primvar = UsdGeom.PrimvarsAPI(prim).CreatePrimvar(name, Sdf.ValueTypeNames.FloatArray, "vertex")
+        primvar.Set(values)
+    stage.GetRootLayer().Save()
+    field = read_material(tmp_path / "field.usda")
+    np.testing.assert_allclose(field.points, [[0.01, -0.03, 0.12], [0.04, -0.06, 0.15]], atol=1e-9)
+    assert field.means == {"youngs_modulus": 2e4, "density": 200.0}
 
 
 def test_the_reach_of_a_brush() -> None:

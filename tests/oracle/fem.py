@@ -537,13 +537,25 @@ def node_mask(mesh: Mesh, region: object) -> NDArray[np.bool_]:
 __all__ = ["TOLERANCE", "ConvergenceError", "Energy", "Mesh", "Minimiser", "Solid", "node_mask", "simulate", "static"]
 
 
-def free_eigenvalues(mesh: Mesh, poissons_ratio: float, count: int = 6, *, stiffness: ArrayLike | None = None) -> Array:
+def free_eigenvalues(
+    mesh: Mesh,
+    poissons_ratio: ArrayLike,
+    count: int = 6,
+    *,
+    stiffness: ArrayLike | None = None,
+    density: ArrayLike | None = None,
+) -> Array:
     """Return the first elastic eigenvalues of a free solid, see `free_modes`."""
-    return free_modes(mesh, poissons_ratio, count, stiffness=stiffness)[0]
+    return free_modes(mesh, poissons_ratio, count, stiffness=stiffness, density=density)[0]
 
 
 def free_modes(
-    mesh: Mesh, poissons_ratio: float, count: int = 6, *, stiffness: ArrayLike | None = None
+    mesh: Mesh,
+    poissons_ratio: ArrayLike,
+    count: int = 6,
+    *,
+    stiffness: ArrayLike | None = None,
+    density: ArrayLike | None = None,
 ) -> tuple[Array, Array]:
     """Return the first elastic eigenvalues of a free solid, per E / rho [1/m^2], ascending, and its modes (node, 3, .).
 
@@ -551,11 +563,12 @@ def free_modes(
 
     Args:
         mesh: Elements of the solid.
-        poissons_ratio: nu.
+        poissons_ratio: nu, of all elements or of each at its points, shape (element_count, 27).
         count: How many.
-        stiffness: Relative Young's modulus of every element, shape (element_count,); ones when None.
+        stiffness: Relative Young's modulus of every element, (element_count,) or likewise; ones when None.
+        density: Relative density, likewise.
     """
-    K, M = linear_matrices(mesh, poissons_ratio, stiffness)
+    K, M = linear_matrices(mesh, poissons_ratio, stiffness, density)
     shift = 1e-3 / np.ptp(mesh.nodes, axis=0).max() ** 2
     shifted = sparse_linalg.splu((K + shift * M).tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
     inverse = sparse_linalg.LinearOperator(K.shape, matvec=shifted.solve, dtype=np.float64)
@@ -584,22 +597,29 @@ def spring_work(mesh: Mesh, poissons_ratio: float, held: NDArray[np.bool_], stif
 
 
 def linear_matrices(
-    mesh: Mesh, poissons_ratio: float, stiffness: ArrayLike | None = None
+    mesh: Mesh, poissons_ratio: ArrayLike, stiffness: ArrayLike | None = None, density: ArrayLike | None = None
 ) -> tuple[sparse.csc_matrix, sparse.csc_matrix]:
     """Return the stiffness [m] per E of linear elasticity, and the mass [m^3] per density, both (3 N, 3 N)."""
-    mu, lam = 1.0 / (2.0 * (1.0 + poissons_ratio)), poissons_ratio / ((1 + poissons_ratio) * (1 - 2 * poissons_ratio))
-    G, w = mesh.gradients, mesh.weights
-    scale = np.ones(len(mesh.elements)) if stiffness is None else np.asarray(stiffness, dtype=np.float64)
-    product = np.einsum("e,eq,eqai,eqbj->eaibj", scale, w, G, G, optimize=True)
-    block = lam * product + mu * product.transpose(0, 1, 4, 3, 2)
-    trace = mu * np.einsum("eaibi->eab", product)
+    nu, G, w = np.asarray(poissons_ratio, dtype=np.float64), mesh.gradients, mesh.weights
+
+    def per_point(values: ArrayLike | None) -> Array:
+        found = np.ones(1) if values is None else np.asarray(values, dtype=np.float64)
+        return w * (found if found.ndim == 2 else found[:, None])
+
+    def products(weights: Array) -> Array:
+        return np.einsum("eq,eqai,eqbj->eaibj", weights, G, G, optimize=True)
+
+    scale = per_point(stiffness)
+    shear = products(scale / (2.0 * (1.0 + nu)))
+    block = products(scale * nu / ((1 + nu) * (1 - 2 * nu))) + shear.transpose(0, 1, 4, 3, 2)
+    trace = np.einsum("eaibi->eab", shear)
     for i in range(3):
         block[:, :, i, :, i] += trace
     dof = (3 * mesh.elements[:, :, None] + np.arange(3)).reshape(len(mesh.elements), 81)
     row, column = np.repeat(dof, 81, axis=1).ravel(), np.tile(dof, (1, 81)).ravel()
     size = 3 * len(mesh.nodes)
     K = sparse.csc_matrix((block.ravel(), (row, column)), shape=(size, size))
-    return K, sparse.csc_matrix(sparse.kron(_mass(mesh, w), sparse.identity(3)))
+    return K, sparse.csc_matrix(sparse.kron(_mass(mesh, per_point(density)), sparse.identity(3)))
 
 
 def _mass(mesh: Mesh, weights: Array) -> sparse.csr_matrix:

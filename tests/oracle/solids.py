@@ -254,12 +254,16 @@ def eigenvalues(body: ReducedBody, poissons_ratio: float, count: int = 6) -> Arr
 
 def stiffness(body: ReducedBody, poissons_ratio: float) -> Array:
     """Return the stiffness of a body at rest per E [m], (3 n, 3 n), from its points and gradients alone."""
-    mu, lam = 1.0 / (2.0 * (1.0 + poissons_ratio)), poissons_ratio / ((1 + poissons_ratio) * (1 - 2 * poissons_ratio))
+    E, nu = body.cubature.moduli(1.0, poissons_ratio)
     G, n = body.cubature.grad_basis.astype(np.float64), body.function_count
-    product = np.einsum("p,pai,pbj->iajb", body.cubature.weights * body.cubature.stiffness_scale, G, G, optimize=True)
-    K = lam * product + mu * product.transpose(2, 1, 0, 3)
+
+    def products(modulus: Array) -> Array:
+        return np.einsum("p,pai,pbj->iajb", body.cubature.weights * modulus, G, G, optimize=True)
+
+    shear = products(E / (2.0 * (1.0 + nu)))
+    K = products(E * nu / ((1.0 + nu) * (1.0 - 2.0 * nu))) + shear.transpose(2, 1, 0, 3)
     for i in range(3):
-        K[i, :, i] += mu * np.einsum("kakb->ab", product)
+        K[i, :, i] += np.einsum("kakb->ab", shear)
     return np.asarray(K.reshape(3 * n, 3 * n))
 
 

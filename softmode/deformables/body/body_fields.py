@@ -18,11 +18,13 @@ from softmode.deformables.body.visibility import Visibility
 TABLES = {
     "hidden_pairs": {"material_points", "hidden_pairs"},
     "detour_pairs": {"material_points", "material_frame", "detour_pairs", "detour_lengths"},
+    "lame_ratio": {"lame_ratio"},
 }
-"""Arrays that only the file of a body has whose kernels do not act across gaps, or go around corners."""
+"""Arrays that only the file of a body has whose kernels do not act across gaps, or go around corners, or whose
+Poisson's ratio varies."""
 _ORDER = (
     ("", "name"),
-    ("cubature.", "points weights grad_basis stiffness_scale"),
+    ("cubature.", "points weights grad_basis stiffness_scale lame_ratio"),
     ("surface.", "surface_points:points surface_normals:normals surface_areas:areas surface_basis:basis"),
     ("", "volume mean_basis linear_coordinates eigenvalues bounds offset"),
     (None, "centres radii kernel"),
@@ -42,6 +44,7 @@ PLACES = {
 }
 """Where a body has each field, in the order of the files; empty for what `made_fields` makes of kernels and regions."""
 GAPS: dict[str, Any] = {
+    "lame_ratio": np.zeros(0),
     "material_points": np.zeros((0, 3)),
     "hidden_pairs": np.zeros(0, dtype=np.int64),
     "material_frame": np.eye(3),

@@ -47,6 +47,7 @@ def check_fields(body: Mapping[str, Any]) -> None:
     expected = {
         "points": (p, 3),
         "weights stiffness_scale": (p,),
+        "lame_ratio": (p,) if len(body["lame_ratio"]) else (0,),
         "grad_basis": (p, n, 3),
         "surface_points surface_normals": (s, 3),
         "surface_areas": (s,),

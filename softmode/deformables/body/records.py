@@ -5,7 +5,7 @@ Its kernels and its handles are records of their own files, `BasisRKPM` or `Basi
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,7 +28,17 @@ class BodyCubature:
     grad_basis: NDArray[np.float32]
     """Gradients of the functions at the points [1/m], shape (P, n, 3), float32."""
     stiffness_scale: Array
-    """Young's modulus relative to the body's, shape (P,)."""
+    """Shear modulus relative to the body's, shape (P,); Young's modulus too where Poisson's ratio does not vary."""
+    lame_ratio: Array = field(default_factory=lambda: np.zeros(0))
+    """lambda / mu relative to the body's, shape (P,); empty where Poisson's ratio does not vary."""
+
+    def moduli(self, youngs_modulus: float, poissons_ratio: float) -> tuple[Array, Array]:
+        """Return Young's modulus [Pa] and Poisson's ratio at the points, (P,), of a body with these: 0 < nu < 0.5."""
+        if not len(self.lame_ratio):
+            return youngs_modulus * self.stiffness_scale, np.full(len(self.points), poissons_ratio)
+        half = self.lame_ratio * poissons_ratio / (1.0 - 2.0 * poissons_ratio)
+        nu = half / (1.0 + 2.0 * half)
+        return youngs_modulus * self.stiffness_scale * (1.0 + nu) / (1.0 + poissons_ratio), nu
 
 
 @dataclass(frozen=True, kw_only=True)

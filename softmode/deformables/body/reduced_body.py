@@ -363,7 +363,7 @@ class ReducedBody:
         for table in TABLES.values():
             if not arrays.keys() & (table - {"material_points"}):
                 names -= table
-        if arrays.keys() & set().union(*TABLES.values()):
+        if arrays.keys() & (set().union(*TABLES.values()) - {"lame_ratio"}):
             names |= {"material_points"}
         if set(header) | set(arrays) != names or set(header) & set(arrays):
             wrong = sorted(names ^ (set(header) | set(arrays)))

@@ -464,8 +464,8 @@ def accumulate_points(
     nu = wp.float64(instances.poissons_ratio[i])
     sums.log_modulus[i, p] = sums.log_modulus[i, p] - V * wp.ddot(L, stress(material, G, G_start, dt))
 
-    # d ln(mu)/d nu = -1 / (1 + nu); dlambda/dnu = E (1 + 2 nu^2) / ((1 + nu) (1 - 2 nu))^2
-    modulus = two * mu * (one + nu)
+    # d ln(mu)/d nu = -1 / (1 + nu); dlambda/dnu = E (1 + 2 nu^2) / ((1 + nu) (1 - 2 nu))^2, times what lambda is there
+    modulus = wp.float64(basis.lame_ratio[point]) * two * mu * (one + nu)
     root = (one + nu) * (one - two * nu)
     material.lam = zero
     by_mu = stress(material, G, G_start, dt) / mu

@@ -194,6 +194,7 @@ def lay_out_bases(model: newton.Model, layout: Layout, contact_max: int) -> Basi
         "gradient": gradient,
         "point_weight": joined("cubature.weights"),
         "stiffness_scale": joined("cubature.stiffness_scale"),
+        "lame_ratio": np.concatenate([_lame_ratio(body) for body in bodies]),
         "mean": blocks(padded([body.mean_basis[None] for body in bodies])),
         "linear": linear,
         "row": blocks(np.concatenate([padded([body.surface.basis for body in bodies]), pin_rows, dynamic])),
@@ -219,6 +220,11 @@ def surface_stiffness(bodies: Sequence[ReducedBody]) -> np.ndarray:
     """
     nearest = [KDTree(body.cubature.points).query(body.surface.points)[1] for body in bodies]
     return np.concatenate([body.cubature.stiffness_scale[index] for body, index in zip(bodies, nearest, strict=True)])
+
+
+def _lame_ratio(body: ReducedBody) -> np.ndarray:
+    """Return lambda / mu at the cubature points of a body relative to the body's, shape (point_count,)."""
+    return body.cubature.lame_ratio if len(body.cubature.lame_ratio) else np.ones(body.point_count)
 
 
 def _size(body: ReducedBody) -> float:

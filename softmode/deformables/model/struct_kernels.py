@@ -31,7 +31,8 @@ class Basis:
     gradient: wp.array3d[vec8]  # (block_count, point_total, 3) [1/m], points side by side in memory
     gradient_across: wp.array3d[vec8]  # the same; on CUDA with blocks side by side, for kernels with a thread per block
     point_weight: wp.array[wp.float64]  # (point_total,) [m^3]
-    stiffness_scale: wp.array[float]  # (point_total,)
+    stiffness_scale: wp.array[float]  # (point_total,), mu over the body's
+    lame_ratio: wp.array[float]  # (point_total,), lambda / mu over the body's
     mean: wp.array2d[vec8d]  # (asset_count, block_count)
     linear: wp.array2d[wp.vec4d]  # (asset_count, stride), c with sum_k b_k c_k = (X, Y, Z, 1)
     row: wp.array2d[vec8]  # (row_total, block_count): samples of all bodies, pins, dynamic rows of shapes, of pairs

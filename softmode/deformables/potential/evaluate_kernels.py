@@ -42,7 +42,7 @@ def material_of(instances: Instances, basis: Basis, i: int, point: int):
     mu, lam = lame(instances.youngs_modulus[i] * basis.stiffness_scale[point], instances.poissons_ratio[i])
     parameters.model = instances.material_model[i]
     parameters.mu = mu
-    parameters.lam = lam
+    parameters.lam = wp.float64(basis.lame_ratio[point]) * lam
     parameters.viscosity = wp.float64(instances.viscosity[i])
     return parameters
 

@@ -117,13 +117,14 @@ def store_hessians(
 
 
 @wp.func
-def lame_lanes(instances: Instances, stiffness_scale: wp.array[float], i: int, point: int, count: int):
+def lame_lanes(instances: Instances, basis: Basis, i: int, point: int, count: int):
     """Return Lame's parameters (mu, lambda) [Pa] at eight points; see ``material_kernels.lame``."""
     one = wp.float64(1.0)
     two = wp.float64(2.0)
-    e = vec8d(instances.youngs_modulus[i] * load_scales(stiffness_scale, point, count))
+    e = vec8d(instances.youngs_modulus[i] * load_scales(basis.stiffness_scale, point, count))
+    ratio = vec8d(load_scales(basis.lame_ratio, point, count))
     nu = wp.float64(instances.poissons_ratio[i])
-    return e / (two * (one + nu)), e * nu / ((one + nu) * (one - two * nu))
+    return e / (two * (one + nu)), wp.cw_mul(ratio, e * nu / ((one + nu) * (one - two * nu)))
 
 
 @wp.func
@@ -150,7 +151,7 @@ def evaluate_eight(
     point = step.instances.point_start[i] + p
     s = wp.float64(step.instances.scale[i])
     rate = wp.float64(step.instances.viscosity[i]) / step.options.dt
-    mu, lam = lame_lanes(step.instances, step.basis.stiffness_scale, i, point, count)
+    mu, lam = lame_lanes(step.instances, step.basis, i, point, count)
     G = elastic_gradients(step.basis.gradient, q, i, point, count, step.instances.function_count[i], s)
     start = G
     if step.instances.viscosity[i] > 0.0:
@@ -171,7 +172,7 @@ def differentiate_eight(step: NewtonStep, i: int, eight: int):
     point = step.instances.point_start[i] + p
     s = wp.float64(step.instances.scale[i])
     rate = wp.float64(step.instances.viscosity[i]) / step.options.dt
-    mu, lam = lame_lanes(step.instances, step.basis.stiffness_scale, i, point, count)
+    mu, lam = lame_lanes(step.instances, step.basis, i, point, count)
     G = elastic_gradients(step.basis.gradient, step.arrays.q, i, point, count, step.instances.function_count[i], s)
     start = G
     if step.instances.viscosity[i] > 0.0:

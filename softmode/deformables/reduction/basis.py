@@ -85,7 +85,11 @@ class Domain:
     volumes: Array
     """Their volumes [m^3], shape (P,)."""
     stiffness: Array
-    """Relative Young's modulus, shape (P,)."""
+    """Relative shear modulus, shape (P,)."""
+    lame_ratio: Array | None
+    """lambda / mu relative to the body's, shape (P,); None where Poisson's ratio does not vary."""
+    scalar_stiffness: Array
+    """Relative lambda + 4 mu, the weight of the eigenmodes, shape (P,)."""
     density: Array
     """Relative density of volume mean one, shape (P,)."""
     seeds: Array
@@ -112,7 +116,7 @@ class Domain:
     def weighed(self, value: Array, gradient: Array) -> RawFunctions:
         """Return raw functions (P, R) and their gradients [1/m] (P, R, 3) with what the points weigh."""
         fraction = self.volumes / self.volumes.sum()
-        return RawFunctions(value, gradient, fraction * self.density, fraction * self.stiffness)
+        return RawFunctions(value, gradient, fraction * self.density, fraction * self.stiffness, self.lame_ratio)
 
     def envelope(self, kernels: BasisRKPM) -> Envelope | None:
         """Return the envelope of the exact regions, if any: one kernel radius wide."""
@@ -251,7 +255,7 @@ def _modes(ground: _Ground, domain: Domain, options: BuildOptions, count: int) -
             ground.shape,
             domain.volumes,
             apart or count,
-            stiffness_scale=domain.stiffness,
+            stiffness_scale=domain.scalar_stiffness,
             springs=None if ground.springs is None else ground.scalar * ground.springs,
             vanishing=envelope is not None,
         )
@@ -259,7 +263,7 @@ def _modes(ground: _Ground, domain: Domain, options: BuildOptions, count: int) -
         # Times the envelope, which takes from modes of the free body what they have at the faces, and no more: modes of
         # the held one rise slowly, and a plate 50:1 of nu = 0.49 was 17 % too stiff where it bends most.
         rest = count - len(found.eigenvalues)
-        free = solve_eigenmodes(ground.plain, domain.volumes, rest, stiffness_scale=domain.stiffness)
+        free = solve_eigenmodes(ground.plain, domain.volumes, rest, stiffness_scale=domain.scalar_stiffness)
         found = Eigenmodes(
             coefficients=np.concatenate([found.coefficients, free.coefficients], axis=1),
             eigenvalues=np.concatenate([found.eigenvalues, free.eigenvalues]),
@@ -279,7 +283,7 @@ def _with_handles(modes: Eigenmodes, local: Array, ground: _Ground, domain: Doma
     """Return modes and, after them, local handles (K, J) with their Rayleigh quotients as eigenvalues."""
     fraction = domain.volumes / domain.volumes.sum()
     size = fraction @ np.square(ground.shape.value @ local)
-    slope = sum((fraction * domain.stiffness) @ np.square(along @ local) for along in ground.shape.gradient)
+    slope = sum((fraction * domain.scalar_stiffness) @ np.square(along @ local) for along in ground.shape.gradient)
     return Eigenmodes(
         coefficients=np.concatenate([modes.coefficients, local], axis=1),
         eigenvalues=np.concatenate([modes.eigenvalues, slope / np.maximum(size, 1e-300)]),
@@ -489,7 +493,7 @@ def _region_weights(domain: Domain, shape: ShapeFunctions, springs: Array | None
     blends = np.zeros((shape.centre_count, max(exact - 1, 0)))
     if springs is None or pull is None:
         return blends
-    given = {"stiffness_scale": domain.stiffness, "springs": springs, "spring_load": pull}
+    given = {"stiffness_scale": domain.scalar_stiffness, "springs": springs, "spring_load": pull}
     soft = solve_harmonic_weights(shape, domain.volumes, **given)
     return np.concatenate([blends, soft[:, 0 if exact else 1 :]], axis=1)
 
@@ -522,6 +526,7 @@ def _weights(
             density=domain.density,
             poissons_ratio=float(np.mean(options.poissons_ratios)),
             stiffness_scale=domain.stiffness,
+            lame_ratio=domain.lame_ratio,
             springs=springs,
             derivative_count=0 if options.chosen else options.response_derivatives,
             mode_count=KERNEL_MODES if options.chosen else 0,

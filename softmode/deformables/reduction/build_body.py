@@ -20,13 +20,13 @@ from softmode.deformables.quadrature.octants import octants_of
 from softmode.deformables.quadrature.quadrature_grid import Quadrature
 from softmode.deformables.reduction.basis import BodyBasis, Domain, make_body_basis
 from softmode.deformables.reduction.cache import cache_directory, cached_body, fingerprint_of
-from softmode.deformables.reduction.cubature import Cubature, select_cubature
+from softmode.deformables.reduction.cubature import POISSON_RATIO, Cubature, select_cubature
 from softmode.deformables.reduction.elastic_functions import EXCESS, EXCESS_WARNING
 from softmode.deformables.reduction.kernel_visibility import lips_of, material_of
 from softmode.deformables.reduction.options import FUNCTION_COUNT, BuildOptions, HandleName
 from softmode.deformables.reduction.region_samples import longest_edge, pieces_near, refine_at_faces, sample_regions
 from softmode.deformables.reduction.sources import Sources, pack_sources
-from softmode.errors import MaterialError, memory_errors
+from softmode.errors import ConfigError, MaterialError, memory_errors
 from softmode.stages import moved
 from softmode.stages import stage as under_way
 
@@ -62,6 +62,7 @@ def build_body(
     regions: Sequence[Region] = (),
     stiffness_scale: Field | None = None,
     density_scale: Field | None = None,
+    poissons_ratio: Field | None = None,
     progress: bool | Progress | None = None,
 ) -> ReducedBody:
     """Reduce an object: kernels, weights, orthonormal functions, cubature.
@@ -77,6 +78,8 @@ def build_body(
             function that returns them (N,) for points (N, 3) of asset coordinates [m]; ones when None. A cell that a
             jump cuts has the values of its points: means over the cell were worse (``docs/accuracy.md``).
         density_scale: Density relative to any common reference, likewise; normalised to volume mean 1.
+        poissons_ratio: Poisson's ratio, likewise, 0 <= nu < 0.5: what it is where the material's is that of the
+            options. Of another material lambda / mu keeps its proportions. None: that of the material everywhere.
         progress: True or False shows a bar or not; None shows one on a terminal when the build exceeds two seconds; a
             callable receives (stage, fraction done).
 
@@ -84,7 +87,7 @@ def build_body(
         The body, in the frame of its centre of mass.
 
     Raises:
-        MaterialError: If a scale is not finite and positive.
+        MaterialError: If a scale is not finite and positive, or a Poisson's ratio lies outside its range.
         BasisError: If the basis cannot be built, or a region holds too few points or overlaps another.
         ConfigError: If options do not fit the object, or regions share a name.
     """
@@ -92,7 +95,12 @@ def build_body(
     # decide the last bits of the result.
     with threadpool_limits(limits=1, user_api="blas"):
         return _build(
-            quadrature, options or BuildOptions(), name, tuple(regions), stiffness_scale, density_scale, progress
+            quadrature,
+            options or BuildOptions(),
+            name,
+            tuple(regions),
+            (stiffness_scale, density_scale, poissons_ratio),
+            progress,
         )
 
 
@@ -102,8 +110,7 @@ def build_part(
     *,
     name: str,
     regions: Sequence[Region],
-    stiffness_scale: Array | None,
-    density_scale: Array | None,
+    fields: tuple[Array | None, Array | None, Array | None],
     progress: bool | Progress | None,
 ) -> ReducedBody:
     """Reduce what a cut leaves, while someone waits: as `build_body`, with cubature points that come several at once.
@@ -113,13 +120,12 @@ def build_part(
         options: Those of the body that was cut.
         name: Name for messages and reports.
         regions: Regions that the part holds enough of.
-        stiffness_scale: Relative Young's modulus, shape (P,), or None.
-        density_scale: Relative density, likewise.
+        fields: Relative Young's modulus, relative density and Poisson's ratio, each of shape (P,) or None.
         progress: As for `build_body`.
     """
     given = tuple(regions)
     with threadpool_limits(limits=1, user_api="blas"):
-        return _build(quadrature, options, name, given, stiffness_scale, density_scale, progress, quick=True)
+        return _build(quadrature, options, name, given, fields, progress, quick=True)
 
 
 @memory_errors("building a body", hint="take fewer kernels, points or functions")
@@ -128,26 +134,30 @@ def _build(
     options: BuildOptions,
     name: str,
     regions: tuple[Region, ...],
-    stiffness_scale: Field | None,
-    density_scale: Field | None,
+    fields: tuple[Field | None, Field | None, Field | None],
     progress: bool | Progress | None,
     *,
     quick: bool = False,
 ) -> ReducedBody:
     """Do what :func:`build_body` and :func:`build_part` say."""
     start = time.perf_counter()
+    stiffness_scale, density_scale, poissons_ratio = fields
     stiffness = positive_field("stiffness_scale", stiffness_scale, quadrature.points)
     density = positive_field("density_scale", density_scale, quadrature.points)
-    fingerprint = body_fingerprint(quadrature, options, name, regions, stiffness, density)
+    ratio = None if poissons_ratio is None else ratio_field(poissons_ratio, quadrature.points)
+    fingerprint = body_fingerprint(quadrature, options, name, regions, stiffness, density, ratio)
     sources = Sources(
         quadrature=quadrature,
         options=options,
         regions=regions,
         stiffness_scale=None if stiffness_scale is None else stiffness,
         density_scale=None if density_scale is None else density,
+        poissons_ratio=ratio,
     )
     pieces = pieces_near(quadrature, regions)
     places, weights = pieces.points, pieces.weights
+    reference = float(np.mean(options.poissons_ratios))
+    shear, lame_ratio, scalar = _relative_moduli(stiffness, ratio, reference)
     stiffness, density = stiffness[pieces.parent], density[pieces.parent]
     density = density * (quadrature.volume / (weights @ density))
     mass = weights * density / quadrature.volume
@@ -157,7 +167,8 @@ def _build(
     regions = tuple(region.moved(offset, bounds) for region in regions)
     samples = sample_regions(regions, pieces, offset, stiffness, quadrature.spacing, bounds)
     points, volumes, parent = refine_at_faces(regions, pieces, offset)
-    stiffness = stiffness[parent]
+    stiffness, scalar = shear[pieces.parent[parent]], scalar[pieces.parent[parent]]
+    lame_ratio = None if lame_ratio is None else lame_ratio[pieces.parent[parent]]
     seconds: dict[str, float] = {}
     with under_way(f"building the body of {name}"), _reporter(progress, name) as report:
 
@@ -171,6 +182,8 @@ def _build(
                 points=points,
                 volumes=volumes,
                 stiffness=stiffness,
+                lame_ratio=lame_ratio,
+                scalar_stiffness=scalar,
                 density=density[parent],
                 seeds=seeds,
                 spacing=quadrature.spacing,
@@ -189,7 +202,7 @@ def _build(
         )
         if not quick:
             _warn_of_stiffness(name, basis, options)
-        chosen = _cubature(volumes, basis, stiffness, options, quick=quick)
+        chosen = _cubature(volumes, basis, stiffness, lame_ratio, options, quick=quick)
         stage("cubature")
         function_count = basis.gradient.shape[1]
         body = ReducedBody(
@@ -199,6 +212,7 @@ def _build(
                 weights=chosen.weights,
                 grad_basis=basis.gradient[chosen.index].astype(np.float32),
                 stiffness_scale=stiffness[chosen.index],
+                lame_ratio=np.zeros(0) if lame_ratio is None else lame_ratio[chosen.index],
             ),
             surface=BodySurface(
                 points=quadrature.surface_points - offset,
@@ -241,7 +255,7 @@ def _build(
         "function_count": function_count,
         "dropped_functions": 0 if options.chosen else len(basis.functions.transform) - function_count,
         **basis.report,
-        "heterogeneous": stiffness_scale is not None or density_scale is not None,
+        "heterogeneous": any(field is not None for field in fields),
         "cubature_count": len(chosen.index),
         "cubature_force_error": chosen.force_error,
         "cubature_stiffness_error": chosen.stiffness_error,
@@ -285,13 +299,32 @@ def body_fingerprint(
     regions: Sequence[Region],
     stiffness: Array,
     density: Array,
+    ratio: Array | None = None,
 ) -> str:
     """Return the fingerprint of all that a body is built from; stiffness and density are relative, one per point."""
-    version = FORMAT_VERSION if regions else FREE_VERSION
-    return fingerprint_of(version, quadrature, options, name, list(regions), stiffness, density)
+    version, varied = FORMAT_VERSION if regions else FREE_VERSION, () if ratio is None else (ratio,)
+    return fingerprint_of(version, quadrature, options, name, list(regions), stiffness, density, *varied)
 
 
-def _cubature(volumes: Array, basis: BodyBasis, stiffness: Array, options: BuildOptions, *, quick: bool) -> Cubature:
+def _relative_moduli(stiffness: Array, ratio: Array | None, reference: float) -> tuple[Array, Array | None, Array]:
+    """Return mu, lambda / mu and lambda + 4 mu relative to those of a Poisson's ratio, (P,) each; None for ones.
+
+    Raises:
+        ConfigError: If the reference is zero, where lambda vanishes.
+    """
+    if ratio is None:
+        return stiffness, None, stiffness
+    if reference <= 0.0:
+        hint = "name a ratio > 0 in BuildOptions, such as the mean of the field"
+        raise ConfigError(f"poissons_ratio: a field beside the material's {reference:g}", hint=hint)
+    shear = stiffness * (1.0 + reference) / (1.0 + ratio)
+    own, common = ratio / (0.5 - ratio), reference / (0.5 - reference)
+    return shear, own / common, shear * (own + 4.0) / (common + 4.0)
+
+
+def _cubature(
+    volumes: Array, basis: BodyBasis, stiffness: Array, lame_ratio: Array | None, options: BuildOptions, *, quick: bool
+) -> Cubature:
     """Choose cubature points: fitted to more poses, or more than asked for, where forces of held-out poses want that.
 
     If none errs as little as was asked for, it is the one that errs least. A quick choice is the first one.
@@ -307,6 +340,8 @@ def _cubature(volumes: Array, basis: BodyBasis, stiffness: Array, options: Build
             basis.gradient,
             count,
             stiffness_scale=stiffness,
+            lame_ratio=lame_ratio,
+            poissons_ratio=POISSON_RATIO if lame_ratio is None else float(np.mean(options.poissons_ratios)),
             driven_count=basis.functions.driven_count,
             pose_count=poses,
             seed=options.seed,
@@ -347,6 +382,34 @@ def positive_field(name: str, value: Field | None, points: Array) -> Array:
         bad = int(np.flatnonzero(~(np.isfinite(found) & (found > 0.0)))[0])
         raise MaterialError(f"{name}: expected finite values > 0, got {found[bad]} at row {bad}")
     return found
+
+
+def ratio_field(value: Field, points: Array) -> Array:
+    """Return Poisson's ratios at points (P, 3), shape (P,).
+
+    Raises:
+        MaterialError: If one lies outside 0 <= nu < 0.5.
+    """
+    found = np.array(value(points) if callable(value) else value, dtype=np.float64)
+    if found.shape != (len(points),):
+        what = f"poissons_ratio: expected one value per quadrature point, shape ({len(points)},), got {found.shape}"
+        raise MaterialError(what)
+    require_ratios("poissons_ratio", found)
+    return found
+
+
+def require_ratios(name: str, values: Array) -> None:
+    """Raise unless all Poisson's ratios lie in 0 <= nu < 0.5.
+
+    Raises:
+        MaterialError: If one does not.
+    """
+    bad = np.flatnonzero(~((values >= 0.0) & (values < 0.5)))
+    if len(bad):
+        raise MaterialError(
+            f"{name}: expected 0 <= nu < 0.5, got {values[bad[0]]} at row {bad[0]}",
+            hint="what hardly changes its volume has 0.49",
+        )
 
 
 @contextlib.contextmanager

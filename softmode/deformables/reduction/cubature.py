@@ -82,6 +82,8 @@ def select_cubature(
     count: int,
     *,
     stiffness_scale: Array | None = None,
+    lame_ratio: Array | None = None,
+    poissons_ratio: float = POISSON_RATIO,
     driven_count: int = 0,
     pose_count: int = POSE_COUNT,
     seed: int = 0,
@@ -99,7 +101,9 @@ def select_cubature(
         weights: Full weights [m^3], shape (P,).
         grad_basis: Gradients of functions that are orthonormal in mass [1/m], shape (P, n, 3).
         count: Number of points to keep; fewer where these fit the forces to 3e-5.
-        stiffness_scale: Relative Young's modulus per point, shape (P,); ones when None.
+        stiffness_scale: Relative shear modulus per point, shape (P,); ones when None.
+        lame_ratio: lambda / mu per point over that of `poissons_ratio`, shape (P,); ones when None.
+        poissons_ratio: Of the training material.
         driven_count: The first so many functions are prescribed and take no part in the elastic modes.
         pose_count: Number of training poses.
         seed: Seed of the poses and projections.
@@ -136,10 +140,10 @@ def select_cubature(
     driven = int(live[:driven_count].sum())
     slope = slope[live]
     gradient = np.ascontiguousarray(gradient[live] / slope[:, None, None])  # (n, 3, P)
-    full = _Sampler(gradient, fraction * modulus)
+    full = _Sampler(gradient, fraction * modulus, poissons_ratio, lame_ratio)
     # What is fitted may be rounded, it is the same on both sides: half the time in half the digits.
     modulus32 = modulus.astype(np.float32)
-    short = _Sampler(gradient.astype(np.float32), (fraction * modulus).astype(np.float32))
+    short = _Sampler(gradient.astype(np.float32), (fraction * modulus).astype(np.float32), poissons_ratio, lame_ratio)
 
     # Rows: the virtual work of each pose's stress on a few random test displacements, per unit of the pose's force.
     tests = rng.normal(size=(3 * _TEST_COUNT, len(slope))) @ gradient.reshape(len(slope), -1) / np.sqrt(_ROWS_PER_POSE)
@@ -170,7 +174,7 @@ def select_cubature(
     reference = np.concatenate([full.force(full.stress(poses)) for poses in _batches(held_out + small)])
     errors, linear = {}, 0.0
     for size, (index, value) in path.items():
-        few = _Sampler(gradient[:, :, index], value * modulus[index])
+        few = full.at(index, value * modulus[index])
         found = few.force(few.stress(held_out + small))
         ratio = np.linalg.norm(found - reference, axis=(1, 2)) / np.linalg.norm(reference, axis=(1, 2))
         errors[size] = float(np.sqrt((ratio[:_HELD_OUT_COUNT] ** 2).mean()))
@@ -178,7 +182,7 @@ def select_cubature(
     index, value = path[max(path)]
     order = np.argsort(index)
     lowest = eigenvalue[:_SOFT_MODE_COUNT]
-    few = _Sampler(gradient[:, :, index], value * modulus[index])
+    few = full.at(index, value * modulus[index])
     rigid = 3 * (len(slope) - driven) - len(eigenvalue)
     found = np.linalg.eigvalsh(_free_stiffness(few, slope, driven))[rigid : rigid + len(lowest)]
     return Cubature(
@@ -195,7 +199,8 @@ def _free_stiffness(points: _Sampler, slope: Array, driven: int) -> Array:
     """Return the stiffness at rest of the functions that are not driven, per unit of mass."""
     scale = np.tile(slope[driven:], 3)
     gradient = points.gradient.reshape(len(slope), 3, -1)[driven:]
-    return scale[:, None] * reduced_stiffness(gradient, points.weights, POISSON_RATIO) * scale
+    found = reduced_stiffness(gradient, points.weights, points.poissons_ratio, points.lame_ratio)
+    return scale[:, None] * found * scale
 
 
 def _per_slope(mode: Array, slope: Array, driven: int) -> Array:
@@ -214,7 +219,7 @@ def _soft_rows(full: _Sampler, eigenvalue: Array, mode: Array, rng: np.random.Ge
         mode: Elastic modes of unit energy, ascending, (M, 3, n).
         rng: Of the combinations.
     """
-    mu, lame = lame_parameters(POISSON_RATIO)
+    mu, lame = full.law
     mixed = rng.normal(size=(_SOFT_TEST_COUNT, len(mode))) @ mode.reshape(len(mode), -1) / np.sqrt(_SOFT_TEST_COUNT)
     soft = full.slopes(mode[:_SOFT_MODE_COUNT])
     tests = np.concatenate([soft, full.slopes(mixed.reshape(-1, *mode.shape[1:]))]).reshape(-1, 9, soft.shape[-1])
@@ -249,9 +254,20 @@ def _batches(poses: list[tuple[Array, Array]]) -> list[list[tuple[Array, Array]]
 class _Sampler:
     """Stresses and forces of a set of weighted points, for several poses at a time."""
 
-    def __init__(self, gradient: Real, weights: Real) -> None:
+    def __init__(self, gradient: Real, weights: Real, poissons_ratio: float, lame_ratio: Array | None) -> None:
         self.gradient = np.ascontiguousarray(gradient).reshape(len(gradient), -1)  # (n, 3 P)
-        self.weights = weights
+        self.weights, self.poissons_ratio, self.lame_ratio = weights, poissons_ratio, lame_ratio
+
+    @property
+    def law(self) -> tuple[float, float | Real]:
+        """Mu and lambda for mu's relative value one; lambda of all points, or of each, (P,)."""
+        mu, lame = lame_parameters(self.poissons_ratio)
+        return mu, lame if self.lame_ratio is None else (lame * self.lame_ratio).astype(self.gradient.dtype)
+
+    def at(self, index: NDArray[np.intp], weights: Array) -> _Sampler:
+        """Return a few of the points with weights of their own."""
+        few = self.gradient.reshape(len(self.gradient), 3, -1)[:, :, index]
+        return _Sampler(few, weights, self.poissons_ratio, None if self.lame_ratio is None else self.lame_ratio[index])
 
     def slopes(self, strain: Array) -> Array:
         """Return grad u of displacements given per function's slope, (N, 3, n) -> (N, 3, 3, P)."""
@@ -263,7 +279,7 @@ class _Sampler:
         inner[:, range(3), range(3)] += 1.0
         turn = np.stack([pose[0] for pose in poses]).astype(inner.dtype)
         turned = (turn @ inner.reshape(len(poses), 3, -1)).reshape(inner.shape)
-        return np.stack([_stress(f) for f in turned])
+        return np.stack([_stress(f, *self.law) for f in turned])
 
     def force(self, stress: Array) -> Array:
         """Return sum_p w_p P_p grad b_p, shape (poses, 3, n)."""
@@ -271,10 +287,8 @@ class _Sampler:
         return (flat @ self.gradient.T).reshape(len(stress), 3, -1)
 
 
-def _stress(f: Array) -> Array:
+def _stress(f: Array, mu: float, lame: float | Array) -> Array:
     """Return P(F), (3, 3, P), of stable Neo-Hookean material with origin term (Smith et al. 2018) for E = 1."""
-    mu = 1.0 / (2.0 * (1.0 + POISSON_RATIO))
-    lame = POISSON_RATIO / ((1.0 + POISSON_RATIO) * (1.0 - 2.0 * POISSON_RATIO))
     m, k = 4.0 / 3.0 * mu, lame + 5.0 / 6.0 * mu
     rest = 1.0 + m / k - m / (4.0 * k)
     cofactor = np.empty_like(f)

@@ -195,14 +195,16 @@ class _Cutter:
     ) -> ReducedBody:
         """Build a part."""
         given, whole = self.given, self.part_count == 1
-        stiffness, density = given.stiffness_scale, given.density_scale
+
+        def own(field: Array | None) -> Array | None:
+            return None if field is None else field[points]
+
         return build_part(
             quadrature,
             self._options(points),
             name=self.body.name if whole else f"{self.body.name} {part + 1}",
             regions=regions,
-            stiffness_scale=None if stiffness is None else stiffness[points],
-            density_scale=None if density is None else density[points],
+            fields=(own(given.stiffness_scale), own(given.density_scale), own(given.poissons_ratio)),
             progress=progress,
         )
 

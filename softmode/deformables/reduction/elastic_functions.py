@@ -30,6 +30,7 @@ doi:10.1145/2508363.2508392), weighted by energy.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -256,12 +257,14 @@ class _Part(NamedTuple):
     """Its functions in the space, shape (V, n)."""
     products: Array
     """Of their gradients, shape (3, n, 3, n)."""
+    volume: Array | None
+    """The same with the weights of lambda; None where lambda / mu does not vary."""
     springs: Array
     """What soft regions add for each component, per E, shape (n, n)."""
 
     def stiffness(self, poissons_ratio: float) -> Array:
         """Return their stiffness with the springs, (3 n, 3 n)."""
-        return elastic_stiffness(self.products, poissons_ratio) + np.kron(np.eye(3), self.springs)
+        return elastic_stiffness(self.products, poissons_ratio, self.volume) + np.kron(np.eye(3), self.springs)
 
 
 class _ElasticSpace:
@@ -279,16 +282,14 @@ class _ElasticSpace:
         self.transform, (self.fixed, self.count) = independent(raw, lead, [(kept, KEPT_TOLERANCE), (others, tolerance)])
         """Functions = raw @ transform, shape (R, V); how many come first in any case, and how many there are."""
         every = self.transform if held is None else np.concatenate([self.transform, held.driven], axis=1)
-        root = np.sqrt(raw.stiff)[:, None]
-        slopes = [raw.gradient[:, :, d] * root for d in range(3)]
-        self.products = np.empty((3, every.shape[1], 3, every.shape[1]))
+        self.products = _products(raw.gradient, raw.stiff, every)
         """sum_p s_p d_i b_k d_j b_l, driven functions last, shape (3, V + r, 3, V + r)."""
-        for d in range(3):
-            for e in range(d + 1):
-                block = every.T @ (slopes[d].T @ slopes[e]) @ every
-                self.products[d, :, e], self.products[e, :, d] = block, block.T
+        self.lame_ratio = raw.lame_ratio
+        self.volume = None if raw.lame_ratio is None else _products(raw.gradient, raw.stiff * raw.lame_ratio, every)
+        """The same with the weights of lambda; None where lambda / mu does not vary."""
         self.free = self.products[:, : self.count, :, : self.count]
         """Those of the functions that are chosen from, shape (3, V, 3, V)."""
+        self.free_volume = None if self.volume is None else self.volume[:, : self.count, :, : self.count]
         self.energy = np.einsum("kakb->ab", self.free)
         self.springs = np.zeros_like(self.energy)
         """What soft regions add to the stiffness of each component, per E, shape (V, V)."""
@@ -356,12 +357,12 @@ class _ElasticSpace:
 
     def restricted(self, chosen: Array) -> _Part:
         """Return the part of the space that some functions (V, n) span."""
-        products = np.empty((3, chosen.shape[1], 3, chosen.shape[1]))
-        for d in range(3):
-            for e in range(d + 1):
-                block = chosen.T @ self.free[d, :, e] @ chosen
-                products[d, :, e], products[e, :, d] = block, block.T
-        return _Part(chosen, products, chosen.T @ self.springs @ chosen)
+
+        def within(products: Array) -> Array:
+            return _symmetric(lambda d, e: chosen.T @ products[d, :, e] @ chosen)
+
+        volume = None if self.free_volume is None else within(self.free_volume)
+        return _Part(chosen, within(self.free), volume, chosen.T @ self.springs @ chosen)
 
     def frequency_error(self, few: _Part, modes: dict[float, Array]) -> float:
         """Return the largest relative error of the first frequencies of a part of the space."""
@@ -398,7 +399,8 @@ class _ElasticSpace:
             BasisError: If nothing holds the body.
         """
         if self.factored is None or self.factored[0] != poissons_ratio:
-            stiffness = elastic_stiffness(self.free, poissons_ratio) + np.kron(np.eye(3), self.springs)
+            stiffness = elastic_stiffness(self.free, poissons_ratio, self.free_volume)
+            stiffness += np.kron(np.eye(3), self.springs)
             try:
                 factor = linalg.cho_factor(stiffness.T, lower=True, check_finite=False)
             except linalg.LinAlgError as error:
@@ -410,7 +412,7 @@ class _ElasticSpace:
         """Return the lowest elastic modes, then Ritz modes of fields, (3 V, T), and their eigenvalues (T,)."""
         count = min(TARGET_COUNT + RIGID, 3 * self.count - 1)
         if self.held is None:
-            stiffness = elastic_stiffness(self.free, poissons_ratio)
+            stiffness = elastic_stiffness(self.free, poissons_ratio, self.free_volume)
             value, mode = _lowest(stiffness, count, 1e3 * floor)
         else:
             stiffness, factor = self._solved(poissons_ratio)
@@ -430,7 +432,7 @@ class _ElasticSpace:
         first = linalg.cho_solve(factor, force)
         first /= np.sqrt(np.einsum("ak,ak->k", first, force))
         raw = np.einsum("rv,avm->mar", self.transform, first.reshape(3, self.count, 3))
-        load, turn = second_order_load(self.slopes, self.stiff, raw, poissons_ratio)
+        load, turn = second_order_load(self.slopes, self.stiff, raw, poissons_ratio, self.lame_ratio)
         reduced = np.einsum("rv,arp->avp", self.transform, load.reshape(3, len(self.transform), -1))
         i, j = np.triu_indices(3)
         load = AMPLITUDE * np.sqrt(turn[i] * turn[j]) * reduced.reshape(len(first), -1)
@@ -448,7 +450,8 @@ class _ElasticSpace:
                 more.append(answer * (LOAD_LEVEL / np.sqrt(np.linalg.eigvalsh(along.T @ answer)[-1])))
         if held.motions.shape[1]:
             # Constraint modes: the body's answer to rigid motions of its exact regions, as Ritz modes.
-            whole = elastic_stiffness(self.products[:, :, :, self.count :], poissons_ratio)
+            volume = None if self.volume is None else self.volume[:, :, :, self.count :]
+            whole = elastic_stiffness(self.products[:, :, :, self.count :], poissons_ratio, volume)
             whole = whole.reshape(3, -1, len(held.motions)) @ held.motions
             pull, own = (part.reshape(-1, part.shape[2]) for part in (whole[:, : self.count], whole[:, self.count :]))
             answer, base = -linalg.cho_solve(factor, pull), held.motions.T @ own
@@ -482,6 +485,24 @@ class _ElasticSpace:
             added -= found @ (found.T @ added)
         more, upper = np.linalg.qr(added)
         return np.concatenate([found, more * np.sign(np.diag(upper))], axis=1), share
+
+
+def _symmetric(block: Callable[[int, int], Array]) -> Array:
+    """Return products (3, n, 3, n) from the blocks (n, n) of d >= e."""
+    first = block(0, 0)
+    found = np.empty((3, len(first), 3, len(first)))
+    for d in range(3):
+        for e in range(d + 1):
+            one = block(d, e) if d else first
+            found[d, :, e], found[e, :, d] = one, one.T
+    return found
+
+
+def _products(gradient: Array, weights: Array, every: Array) -> Array:
+    """Return sum_p w_p d_i b_k d_j b_l of functions = raw @ every, (3, V, 3, V), from raw gradients (P, R, 3)."""
+    root = np.sqrt(weights)[:, None]
+    slopes = [gradient[:, :, d] * root for d in range(3)]
+    return _symmetric(lambda d, e: every.T @ (slopes[d].T @ slopes[e]) @ every)
 
 
 def _lowest(stiffness: Array, count: int, shift: float = 0.0, factor: Any = None) -> tuple[Array, Array]:

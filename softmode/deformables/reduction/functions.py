@@ -48,7 +48,9 @@ class RawFunctions(NamedTuple):
     mass: Array
     """Fractions of mass V_p rho_p / V, shape (P,)."""
     stiff: Array
-    """Fractions of volume times relative Young's modulus, shape (P,)."""
+    """Fractions of volume times relative shear modulus, shape (P,)."""
+    lame_ratio: Array | None = None
+    """lambda / mu relative to the body's, shape (P,); None where Poisson's ratio does not vary."""
 
     def products(self, index: NDArray[np.intp]) -> Array:
         """Return the mass products of all functions with some of them, shape (R, len(index))."""

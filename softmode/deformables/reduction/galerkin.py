@@ -39,14 +39,14 @@ def mass_and_gradient_matrix(shape: ShapeFunctions, weights: Array, stiff: Array
     return mass, energy
 
 
-def elastic_matrix(shape: ShapeFunctions, weights: Array, mu: float, lame: float) -> Array:
+def elastic_matrix(shape: ShapeFunctions, weights: Array, mu: float, lame: float | Array) -> Array:
     """Return the stiffness of linear elasticity, sum_p w_p (2 mu e_k : e_l + lambda tr e_k tr e_l).
 
     Args:
         shape: Kernels at the points, (P, K).
         weights: Volumes times relative stiffness, shape (P,).
         mu: Shear modulus.
-        lame: Lame's first parameter.
+        lame: Lame's first parameter, at all points or at each, shape (P,).
 
     Returns:
         Matrix (3 K, 3 K); unknown (component a, kernel k) is row a K + k.
@@ -57,11 +57,14 @@ def elastic_matrix(shape: ShapeFunctions, weights: Array, mu: float, lame: float
     for rows, columns, _, gradient in _dense_blocks(shape):
         slope = gradient * root[rows, None]
         product = [[slope[a].T @ slope[b] for b in range(a + 1)] for a in range(3)]
-        trace = product[0][0] + product[1][1] + product[2][2]
+        trace, volume = product[0][0] + product[1][1] + product[2][2], product
+        if isinstance(lame, np.ndarray):
+            volume = [[slope[a].T @ (lame[rows, None] * slope[b]) for b in range(a + 1)] for a in range(3)]
         pick = np.ix_(columns, columns)
         for a in range(3):
             for b in range(a + 1):
-                block = lame * product[a][b] + mu * product[a][b].T
+                along = volume[a][b] if volume is not product else lame * product[a][b]
+                block = along + mu * product[a][b].T
                 if a == b:
                     block = block + mu * trace
                 found[a, :, b, :][pick] += block

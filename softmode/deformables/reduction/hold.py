@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.body.regions import Region
-from softmode.deformables.reduction.build_body import Field, build_body, positive_field
+from softmode.deformables.reduction.build_body import Field, build_body, positive_field, ratio_field
 from softmode.deformables.reduction.sources import Sources, mass_points, unpack_sources
 from softmode.errors import ConfigError
 
@@ -51,6 +51,7 @@ def paint(
     *,
     stiffness_scale: Field | None = None,
     density_scale: Field | None = None,
+    poissons_ratio: Field | None = None,
     progress: bool | Callable[[str, float], None] | None = None,
 ) -> ReducedBody:
     """Return the body that a build with other fields would have given.
@@ -59,17 +60,20 @@ def paint(
         body: As for :func:`hold`.
         stiffness_scale: Relative Young's modulus, as for :func:`build_body`; None leaves what it has.
         density_scale: Relative density, likewise.
+        poissons_ratio: Poisson's ratio, likewise.
         progress: As for :func:`build_body`.
 
     Raises:
         ConfigError: If the body keeps no sources.
-        MaterialError: If a scale is not finite and positive.
+        MaterialError: If a scale is not finite and positive, or a Poisson's ratio lies outside 0 <= nu < 0.5.
         AssetError: If the sources are damaged.
     """
     given = unpack_sources(body)
     points = given.quadrature.points
     fields = {"stiffness_scale": stiffness_scale, "density_scale": density_scale}
     changed = {name: positive_field(name, value, points) for name, value in fields.items() if value is not None}
+    if poissons_ratio is not None:
+        changed["poissons_ratio"] = ratio_field(poissons_ratio, points)
     return _again(body, dataclasses.replace(given, **changed), progress)
 
 
@@ -82,6 +86,7 @@ def _again(body: ReducedBody, given: Sources, progress: bool | Callable[[str, fl
         regions=given.regions,
         stiffness_scale=given.stiffness_scale,
         density_scale=given.density_scale,
+        poissons_ratio=given.poissons_ratio,
         progress=progress,
     )
     return dataclasses.replace(made, provenance={**body.provenance, **made.provenance})

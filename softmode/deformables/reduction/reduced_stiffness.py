@@ -18,26 +18,35 @@ NULL_TOLERANCE = 1e-12
 """Eigenvalues under this fraction of the largest are rigid motions. A held rod of 50:1 has 3e-9; rounding is 1e-15."""
 
 
-def reduced_stiffness(gradient: Array, weights: Array, poissons_ratio: float) -> Array:
+def reduced_stiffness(gradient: Array, weights: Array, poissons_ratio: float, lame_ratio: Array | None = None) -> Array:
     """Return K_(ia)(jb) = sum_p w_p (lame d_i b_a d_j b_b + mu d_j b_a d_i b_b + mu delta_ij grad b_a . grad b_b).
 
     Args:
         gradient: Gradients of n functions [1/m], shape (n, 3, P).
-        weights: Volumes times relative Young's modulus [m^3], shape (P,).
+        weights: Volumes times relative shear modulus [m^3], shape (P,).
         poissons_ratio: Poisson's ratio.
+        lame_ratio: lambda / mu of the points over that of this ratio, shape (P,); None or empty: one.
 
     Returns:
         Linear elastic stiffness for E = 1 [m], shape (3 n, 3 n); all x components first, then y, then z.
     """
     count = len(gradient)
     flat = gradient.transpose(1, 0, 2).reshape(3 * count, -1)
-    return elastic_stiffness(((flat * weights) @ flat.T).reshape(3, count, 3, count), poissons_ratio)
+
+    def products(weight: Array) -> Array:
+        return ((flat * weight) @ flat.T).reshape(3, count, 3, count)
+
+    volume = None if lame_ratio is None or not len(lame_ratio) else products(weights * lame_ratio)
+    return elastic_stiffness(products(weights), poissons_ratio, volume)
 
 
-def elastic_stiffness(products: Array, poissons_ratio: float) -> Array:
-    """Return the stiffness for E = 1, (3 n, 3 n), from sum_p w_p d_i b_k d_j b_l, (3, n, 3, n); x components first."""
+def elastic_stiffness(products: Array, poissons_ratio: float, volume: Array | None = None) -> Array:
+    """Return the stiffness for E = 1, (3 n, 3 n), from sum_p w_p d_i b_k d_j b_l, (3, n, 3, n); x components first.
+
+    Where lambda / mu varies, ``volume`` has these sums with the w_p of lambda.
+    """
     mu, lame = lame_parameters(poissons_ratio)
-    found = lame * products + mu * products.transpose(2, 1, 0, 3)
+    found = lame * (products if volume is None else volume) + mu * products.transpose(2, 1, 0, 3)
     trace = mu * np.einsum("kakb->ab", products)
     for i in range(3):
         found[i, :, i] += trace

@@ -423,7 +423,7 @@ def _check_stiffness(body: ReducedBody, interior: Interior, gradient: Array, not
     free = slice(body.driven_count, None)
     few = body.cubature.grad_basis.astype(np.float64)[:, free].transpose(1, 2, 0)
     modulus = body.cubature.weights * body.cubature.stiffness_scale
-    chosen = np.linalg.eigvalsh(reduced_stiffness(few, modulus, POISSON_RATIO))
+    chosen = np.linalg.eigvalsh(reduced_stiffness(few, modulus, POISSON_RATIO, body.cubature.lame_ratio))
     rigid = 0 if body.driven_count else 6
     gradient = gradient[:, free]
     stiffness = reduced_stiffness(np.ascontiguousarray(gradient.transpose(1, 2, 0)), interior.weights, POISSON_RATIO)

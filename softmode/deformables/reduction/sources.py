@@ -34,6 +34,12 @@ class Sources:
     """Relative Young's modulus per quadrature point, shape (P,), or None."""
     density_scale: Array | None
     """Relative density, likewise."""
+    poissons_ratio: Array | None = None
+    """Poisson's ratio, likewise."""
+
+
+FIELDS = ("stiffness_scale", "density_scale", "poissons_ratio")
+"""Fields of material."""
 
 
 def pack_sources(sources: Sources) -> dict[str, NDArray[Any]]:
@@ -41,7 +47,7 @@ def pack_sources(sources: Sources) -> dict[str, NDArray[Any]]:
     arrays, told = _split(sources.quadrature)
     if sources.quadrature.cells is not None:
         arrays |= {f"cells.{name}": value for name, value in _split(sources.quadrature.cells)[0].items()}
-    for name in ("stiffness_scale", "density_scale"):
+    for name in FIELDS:
         if getattr(sources, name) is not None:
             arrays[name] = np.asarray(getattr(sources, name), dtype=np.float64)
     regions = [
@@ -68,7 +74,7 @@ def unpack_sources(body: ReducedBody) -> Sources:
     stored = dict(body.sources)
     try:
         document = json.loads(stored.pop("document").tobytes())
-        stiffness, density = stored.pop("stiffness_scale", None), stored.pop("density_scale", None)
+        fields = {name: stored.pop(name, None) for name in FIELDS}
         cells = {name.removeprefix("cells."): stored.pop(name) for name in list(stored) if name.startswith("cells.")}
         members = {name: stored.pop(name).astype(bool) for name in ("members", "satellites") if name in stored}
         quadrature: dict[str, Any] = {**document["quadrature"], **stored, **members}
@@ -79,8 +85,7 @@ def unpack_sources(body: ReducedBody) -> Sources:
             quadrature=Quadrature(**quadrature, cells=Cells(**cells) if cells else None),
             options=BuildOptions(**options),
             regions=tuple(Region(**region) for region in document["regions"]),
-            stiffness_scale=stiffness,
-            density_scale=density,
+            **fields,
         )
     except Exception as error:  # whatever fields of other types and shapes lead to
         raise AssetError(

@@ -45,6 +45,7 @@ def solve_static_responses(
     density: Array,
     poissons_ratio: float,
     stiffness_scale: Array,
+    lame_ratio: Array | None = None,
     springs: Array | None = None,
     derivative_count: int = 0,
     mode_count: int = 0,
@@ -56,7 +57,8 @@ def solve_static_responses(
         weights: Quadrature weights [m^3], shape (P,).
         density: Relative density, shape (P,); the forces are proportional to it.
         poissons_ratio: Poisson's ratio of the response.
-        stiffness_scale: Relative Young's modulus, shape (P,).
+        stiffness_scale: Relative shear modulus, shape (P,).
+        lame_ratio: lambda / mu relative to the body's, shape (P,); None where it does not vary.
         springs: sum_r kappa / E V_r phi phi^T [m] of soft regions, shape (K, K).
         derivative_count: How many second-order weights to keep, 0..18.
         mode_count: Elastic modes of the kernels, whose components serve as weights too. They know the warping of a
@@ -71,7 +73,8 @@ def solve_static_responses(
     """
     count = shape.centre_count
     stiff = weights * stiffness_scale
-    matrix = elastic_matrix(shape, stiff, *lame_parameters(poissons_ratio))
+    mu, lame = lame_parameters(poissons_ratio)
+    matrix = elastic_matrix(shape, stiff, mu, lame if lame_ratio is None else lame * lame_ratio)
     if springs is not None:
         for a in range(3):
             matrix[a * count : (a + 1) * count, a * count : (a + 1) * count] += springs
@@ -87,7 +90,8 @@ def solve_static_responses(
         parts.append(modes[part > MODE_LEAST * part.max()])
     if derivative_count:
         energy = mass_and_gradient_matrix(shape, weights, stiff)[1]
-        load = second_order_load(shape.gradient, stiff, response.T.reshape(3, 3, count), poissons_ratio)[0]
+        raw = response.T.reshape(3, 3, count)
+        load = second_order_load(shape.gradient, stiff, raw, poissons_ratio, lame_ratio)[0]
         second = solve(load).reshape(3, count, -1).transpose(2, 0, 1).reshape(-1, count)
         # Without what the first order holds, in the gradient energy, and the rest by its share of that energy.
         flat = parts[0] / np.sqrt(np.einsum("ik,kl,il->i", parts[0], energy, parts[0], optimize=True))[:, None]
@@ -117,7 +121,11 @@ def _modes(solve: Callable[[Array], Array], mass: Array, mode_count: int) -> Arr
 
 
 def second_order_load(
-    gradient: Sequence[sparse.csr_matrix | Array], stiff: Array, response: Array, poissons_ratio: float
+    gradient: Sequence[sparse.csr_matrix | Array],
+    stiff: Array,
+    response: Array,
+    poissons_ratio: float,
+    lame_ratio: Array | None = None,
 ) -> tuple[Array, Array]:
     """Return the forces -d2f/dq_i dq_j of u = sum_i q_i u_i in St. Venant-Kirchhoff material, (3 K, 6), and sizes (3,).
 
@@ -126,9 +134,10 @@ def second_order_load(
 
     Args:
         gradient: Gradients of K functions at the quadrature points along each axis, three matrices (P, K).
-        stiff: Volumes times relative Young's modulus, shape (P,).
+        stiff: Volumes times relative shear modulus, shape (P,).
         response: Coefficients of u_i, (3, 3, K), divided here by the root mean squares of their gradients, the sizes.
         poissons_ratio: Poisson's ratio.
+        lame_ratio: lambda / mu relative to that of this ratio, shape (P,); None where it does not vary.
     """
     mu, lame = lame_parameters(poissons_ratio)
     slopes, sizes = [], []
@@ -139,7 +148,9 @@ def second_order_load(
 
     def stress(matrix: Array) -> Array:
         strain = 0.5 * (matrix + matrix.transpose(0, 2, 1))
-        return lame * np.trace(strain, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 2.0 * mu * strain
+        pressure = lame * np.trace(strain, axis1=1, axis2=2)
+        pressure = pressure if lame_ratio is None else lame_ratio * pressure
+        return pressure[:, None, None] * np.eye(3) + 2.0 * mu * strain
 
     stresses = []
     for i in range(3):
