@@ -430,7 +430,8 @@ class MpmSimulation:
             hint, told = "take smaller steps, more damping or a weaker control", ""
             if kind == LEFT_GRID:
                 count = self.bodies[world].count
-                out = count - int(self.options.grid.holds(self.last.x.numpy()[world, :count]).sum())
+                x = np.asarray(self.last.x.numpy()[world, :count], dtype=np.float64)
+                out = count - int(self.options.grid.holds(x).sum())
                 told = f"; {out} of {count} are outside, where they stand still and weigh nothing"
                 hint = "take a larger grid (Grid.around(..., room=)), more damping, a weaker control or slower shapes"
             what = f"particle {particle} {REASONS[int(kind)]}{told}"

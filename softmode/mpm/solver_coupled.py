@@ -8,6 +8,7 @@ import newton
 import warp as wp
 from newton.solvers import SolverBase
 
+from softmode.deformables.model.declare import WRENCH
 from softmode.deformables.model.tables import present
 from softmode.errors import ConfigError
 from softmode.mpm.simulation import MpmSimulation
@@ -48,7 +49,7 @@ class SolverCoupledParticles(SolverBase):
         self.dt = particles.step_count * particles.options.dt
         """Duration of a step [s]."""
         self._start = [wp.clone(array) for array in particles.first.arrays]
-        self._body_f = wp.zeros(solver.model.body_count, dtype=wp.spatial_vector, device=solver.model.device)
+        self._body_f = wp.zeros(solver.model.body_count, dtype=WRENCH, device=solver.model.device)
 
     def step(
         self,

@@ -59,7 +59,7 @@ def test_a_bar_yields_at_its_stress() -> None:
     def side(along: float) -> float:
         return float(brentq(lambda t: MU * (t * t - 1.0) + LAM * np.log(along * t * t), 0.5, 1.5, xtol=1e-15))
 
-    onset = brentq(lambda a: MU * (a * a - side(a) ** 2) - YIELD, 1.0, 1.5, xtol=1e-15)
+    onset = float(brentq(lambda a: MU * (a * a - side(a) ** 2) - YIELD, 1.0, 1.5, xtol=1e-15))
     at = np.diag([onset, side(onset), side(onset)])
     below = np.diag([1.0 + 0.999 * (onset - 1.0)] + [side(1.0 + 0.999 * (onset - 1.0))] * 2)
     flow = [np.diag([a, a**-0.5, a**-0.5]) @ at for a in (1.01, 1.2, 1.5)]  # that of volume stays
