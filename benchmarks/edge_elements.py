@@ -16,13 +16,14 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Sequence
 from itertools import permutations
+from typing import Any
 
 import numpy as np
 from scipy import sparse
 from scipy.sparse import linalg
 from scipy.spatial import KDTree
 
-from benchmarks.hertz_elements import Array, Ints, integrate, stress
+from benchmarks.hertz_elements import Array, Ints, Mask, integrate, stress
 
 DEPTHS = (0.01, 0.02, 0.03, 0.05)
 """Over the edge."""
@@ -72,7 +73,7 @@ def face(index: Ints, lines: Sequence[Array], axis: int, end: int) -> tuple[Ints
 def joined(faces: Sequence[tuple[Ints, Array]]) -> tuple[Ints, Array]:
     """Return nodes and areas of several faces, each node once."""
     nodes, places = np.unique(np.concatenate([nodes for nodes, _ in faces]), return_inverse=True)
-    return nodes, np.bincount(places, np.concatenate([area for _, area in faces]))
+    return nodes, np.asarray(np.bincount(places, np.concatenate([area for _, area in faces])), dtype=float)
 
 
 def wedge(across: int, along: int, deep: int) -> Array:
@@ -104,7 +105,7 @@ def own_edge(across: int, along: int) -> Array:
     lines = (both(across), 0.5 * np.linspace(0.0, 1.0, along + 1), both(across))
     x, index, corners = grid(lines)
     swap, back = np.eye(3)[[2, 1, 0]], np.diag([-1.0, 1.0, -1.0])
-    alike = symmetric(x, [np.eye(3), swap, back, back @ swap])
+    alike: Any = symmetric(x, [np.eye(3), swap, back, back @ swap])
     moves = np.ones(x.shape)
     moves[x[:, 1] < 1.0e-9, 1] = 0.0
     alike = (sparse.diags(moves.ravel()) @ alike).tocsc()
@@ -130,7 +131,7 @@ def between_plates(up: Array, half: float, faces: Callable[[int], tuple[Ints, Ar
     return [below, (*faces(-1), lambda depth: (-up[None], np.array([depth - half])))]
 
 
-def only(x: Array, held: Array) -> sparse.csr_matrix:
+def only(x: Array, held: Mask) -> sparse.csr_matrix:
     """Return the motions of what is not held."""
     free = np.flatnonzero(~held.ravel())
     return sparse.csr_matrix((np.ones(len(free)), (free, np.arange(len(free)))), (x.size, len(free)))
@@ -138,7 +139,7 @@ def only(x: Array, held: Array) -> sparse.csr_matrix:
 
 def symmetric(x: Array, group: Sequence[Array]) -> sparse.csr_matrix:
     """Return the motions of nodes that are the same under a group of matrices, which map the nodes to each other."""
-    images = [KDTree(x).query(x @ g.T)[1] for g in group]
+    images = [np.asarray(KDTree(x).query(x @ g.T)[1]) for g in group]
     seen: set[int] = set()
     rows, columns, values, count = [], [], [], 0
     for node in range(len(x)):
