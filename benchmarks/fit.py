@@ -210,7 +210,7 @@ def run(
         f" {first_frequency(truth, youngs_modulus, made):.1f} Hz volume {thing.body.volume / truth.body.volume:.3f}"
     )
     try:
-        found, _, x = fit_film(thing, clip, camera, held, material=material, plate=plate, progress=tell, device=device)
+        found, _, x = fit_film(thing, clip, camera, material=material, plate=plate, progress=tell, device=device)
     except SoftmodeError as error:
         print(f"{about} refused: {error}", flush=True)
         raise
@@ -278,7 +278,8 @@ def main() -> None:
         wrong = sum(certain_and_wrong(*pair) for pair in zip(error, bar, strict=True))
         print(
             f"{len(rows)} films, {refused} refused: median {np.median(error):.3f}, largest {error.max():.3f}; within"
-            f" one bar {np.mean(error < bar):.0%}, within two {np.mean(error < 2.0 * bar):.0%}; certain and wrong {wrong};"
+            f" one bar {np.mean(error < bar):.0%}, within two {np.mean(error < 2.0 * bar):.0%};"
+            f" certain and wrong {wrong};"
             f" bars under 10 %: {(bar < 0.1).sum()}, largest error of these {error[bar < 0.1].max(initial=0.0):.3f}"
         )
 

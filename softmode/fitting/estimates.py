@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ import numpy as np
 from softmode import __version__
 from softmode.deformables.materials.material import Material
 from softmode.files import PendingFile
+from softmode.fitting.least_squares import Array, Space
 from softmode.objects.object_file import write_object
 from softmode.objects.soft_object import SoftObject
 
@@ -22,6 +24,11 @@ THIN = (0.05, 0.12)
 """Mean thickness over size, and what it adds to it: a mug was off by 17 %, its walls filled too thick."""
 CERTAIN = 0.35
 """Standard deviation of a logarithm above which a parameter is not observable."""
+UNSEEN = {
+    "density": "a motion shows E over density and nothing else: weigh the object",
+    "friction": "nothing slides on an object that is held",
+}
+"""Numbers of a material that no fit finds, and why."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,6 +55,40 @@ class Estimate:
         known = deviation < CERTAIN and not reason
         told = reason or ("" if known else f"the bar spans a factor of {high / low:.2g}")
         return cls(value=math.exp(mean), low=low, high=high, observable=known, unit=unit, reason=told)
+
+
+def asked_for(
+    free: Sequence[str], material: Material, space: Space, x: Array, deviations: Mapping[str, float]
+) -> dict[str, Estimate]:
+    """Return the estimates of numbers that a fit was asked for; those of `UNSEEN` are what was told.
+
+    Args:
+        free: Their names.
+        material: What was told.
+        space: The parameters of the fit.
+        x: Their values.
+        deviations: The standard deviations of those that were free.
+    """
+    found = {}
+    for name in free:
+        unit, reason = {"mass_damping": "1/s", "density": "kg/m^3"}.get(name, ""), UNSEEN.get(name, "")
+        value, deviation = float(getattr(material, name)), 0.0
+        if not reason:
+            at = space.names.index(name)
+            value, deviation = float(x[at]), deviations[name]
+            if deviation > 0.5 * space.prior[at]:
+                reason = (
+                    f"the data look the same from {value - deviation:.2g} to {value + deviation:.2g} {unit}".rstrip()
+                )
+        bars = {"low": value - deviation, "high": value + deviation}
+        found[name] = Estimate(value=value, **bars, observable=not reason, unit=unit, reason=reason)
+    return found
+
+
+def made_of(material: Material, estimates: Mapping[str, Estimate]) -> Material:
+    """Return a material with the numbers of it that are observable."""
+    names = [name for name, one in estimates.items() if one.observable and hasattr(material, name)]
+    return replace(material, **{name: estimates[name].value for name in names})
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -113,15 +154,11 @@ class Fitted:
             path: The .npz to write.
             thing: The object, free; what was found and from which film goes into its body's provenance.
         """
-        names = ("youngs_modulus", "poissons_ratio", "density", "viscosity", "friction")
+        names = ("youngs_modulus", "poissons_ratio", "density", "viscosity", "mass_damping", "friction")
         numbers = {name: getattr(self.material, name) for name in names}
-        bars = {name: [e.low, e.high] for name, e in self.estimates.items() if e.observable}
-        told = {
-            "material": json.dumps(numbers),
-            "fit_source": self.source,
-            "fit_fingerprint": self.fingerprint,
-            "fit_bars": json.dumps(bars),
-        }
+        bars = {name: [one.low, one.value, one.high] for name, one in self.estimates.items() if one.observable}
+        fit = {"source": self.source, "fingerprint": self.fingerprint, "parameters": bars}
+        told = {"material": json.dumps(numbers), "fit": json.dumps(fit)}
         body = replace(thing.body, provenance={**thing.body.provenance, **told})
         write_object(path, body, thing.splats, thing.radiance)
         return replace(thing, body=body, material=self.material)

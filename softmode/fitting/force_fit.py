@@ -22,13 +22,12 @@ from softmode.deformables.model.status import (
     status_reasons,
 )
 from softmode.deformables.model.tables import present
-from softmode.deformables.solver.solver_reduced import SolverReduced
 from softmode.errors import ConfigError, FitError, SolverDiverged
-from softmode.fitting.estimates import Estimate, Fitted, floor_of
+from softmode.fitting.estimates import Estimate, Fitted, floor_of, made_of
 from softmode.fitting.tables import ForceLog
+from softmode.fitting.worlds import FitWorlds
 from softmode.objects.frame import in_body
 from softmode.objects.soft_object import SoftObject
-from softmode.scenes.capture import capture_graph
 
 Array = NDArray[np.float64]
 START = 1.0e5
@@ -74,7 +73,7 @@ class Press:
         """
         low, high = body.surface.points.min(axis=0), body.surface.points.max(axis=0)
         wide = 2.0 * float((high - low).max())
-        world, builder = newton.ModelBuilder(), newton.ModelBuilder()
+        world = newton.ModelBuilder()
         add_reduced_body(world, body, material=replace(material, mass_damping=20.0))
         press = world.add_body(is_kinematic=True, xform=wp.transform((0.0, 0.0, 10.0 * wide), wp.quat_identity()))
         config = newton.ModelBuilder.ShapeConfig(mu=1.0)
@@ -88,35 +87,27 @@ class Press:
         else:
             start, toward = low + high - behind, -axis
             world.add_shape_box(press, **plate)
-        builder.replicate(world, len(depths))
-        model = builder.finalize(device=device)
+        worlds = FitWorlds(world, body, len(depths), dt=STEP, device=device)
         # the file has the object as it rests, and forces are those beyond its weight
-        model.set_gravity((0.0, 0.0, 0.0))
-        solver, states = SolverReduced(model, [body]), (model.state(), model.state())
-        poses = present(states[0].body_q).numpy()
+        worlds.model.set_gravity((0.0, 0.0, 0.0))
+        poses = present(worlds.states[0].body_q).numpy()
         poses[:, 3:] = (0.0, 0.0, 0.0, 1.0)
-
-        def both() -> None:
-            solver.step(states[0], states[1], None, None, STEP)
-            solver.step(states[1], states[0], None, None, STEP)
 
         def place(share: float) -> None:
             poses[:, :3] = start + toward * (share * depths)[:, None]
-            for state in states:
+            for state in worlds.states:
                 present(state.body_q).assign(poses)
 
         place(0.0)
-        graph = capture_graph(both, model.device)
-        for state in states:
-            solver.reset(state)
+        worlds.reset()
         for k in range((RAMP + REST) // 2):
             place(min(1.0, (2 * k + 2) / RAMP))
-            graph.launch()
-        for depth, bits in zip(depths, solver.status.numpy(), strict=True):
+            worlds.step_twice()
+        for depth, bits in zip(depths, worlds.solver.status.numpy(), strict=True):
             if bits & FAILED:
                 what = f"{1e3 * depth:.3g} mm deep: {', '.join(status_reasons(int(bits)))}"
                 raise SolverDiverged(what, hint="check the units of the depths, the place and the size of the object")
-        wrench = solver.body_wrench.numpy().reshape(len(depths), -1)[:, :3]
+        wrench = worlds.solver.body_wrench.numpy().reshape(len(depths), -1)[:, :3]
         return -(wrench @ toward)
 
     def _contact(self, body: ReducedBody, place: ArrayLike) -> tuple[Array, Array]:
@@ -208,7 +199,7 @@ def fit_force(
         source=log.source,
         fingerprint=log.fingerprint,
         estimates={"youngs_modulus": estimate},
-        material=replace(material, youngs_modulus=modulus) if estimate.observable else material,
+        material=made_of(material, {"youngs_modulus": estimate}),
         notes=tuple(notes),
         details={"depths": depths.tolist(), "forces": (factor * made).tolist(), "touch": shift},
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +18,8 @@ HUBER = 2.5
 """Residuals beyond this count by their size and not by its square."""
 TOLERANCE = 1.0e-3
 """Relative change of the cost, and of the parameters in their priors, at which it ends."""
+
+_FIELDS = ("mean", "prior", "step", "low", "high")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -37,6 +39,11 @@ class Space:
     high: Array
     """Largest values (p,)."""
 
+    @classmethod
+    def of(cls, rows: Mapping[str, Sequence[float]]) -> Space:
+        """Return the space of rows: mean, prior, step, least and largest value of each parameter."""
+        return cls(names=tuple(rows), **dict(zip(_FIELDS, np.array(list(rows.values())).T, strict=True)))
+
     def changed(self, values: Array, name: str, value: float) -> Array:
         """Return values (p,) with another one of a parameter."""
         return np.where(np.arange(len(self.names)) == self.names.index(name), value, values)
@@ -50,8 +57,10 @@ class Space:
 class Solution:
     """Where least squares ended."""
 
+    space: Space
+    """The parameters."""
     x: Array
-    """Parameters (p,)."""
+    """Their values (p,)."""
     free: NDArray[np.intp]
     """Which of them were free (k)."""
     converged: bool
@@ -152,6 +161,7 @@ def minimise(
     x[which] = found.x
     m = len(r) - len(which)
     return Solution(
+        space=space,
         x=x,
         free=which,
         converged=found.status > 0,

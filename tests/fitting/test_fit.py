@@ -51,7 +51,7 @@ def test_film(tmp_path: Path) -> None:
     clip = Clip(frames=frames, times=np.arange(len(frames)) / 30.0)
     thing = bar(24)
     unknown = replace(TRUE, youngs_modulus=1.0e5, viscosity=0.0)
-    found, residuals, _ = fit_film(thing, clip, camera, HELD, material=unknown, plate=plate)
+    found, residuals, _ = fit_film(thing, clip, camera, material=unknown, plate=plate)
     modulus = found["youngs_modulus"]
     error = np.log(modulus.value / TRUE.youngs_modulus)
     assert modulus.observable and abs(error) < min(0.08, 2.0 * np.log(modulus.high / modulus.value))
@@ -70,13 +70,13 @@ def test_film(tmp_path: Path) -> None:
 
     part = tmp_path / "part.json"
     with pytest.raises(KeyboardInterrupt):
-        fit_film(thing, clip, camera, HELD, material=unknown, plate=plate, keep=part, progress=cut)
-    gone_on, late, _ = fit_film(thing, clip, camera, HELD, material=unknown, plate=plate, keep=part)
+        fit_film(thing, clip, camera, material=unknown, plate=plate, keep=part, progress=cut)
+    gone_on, late, _ = fit_film(thing, clip, camera, material=unknown, plate=plate, keep=part)
     assert gone_on.estimates == found.estimates and not part.exists()
     assert late.worlds.steps < 0.6 * residuals.worlds.steps
     with pytest.raises(FitError, match="overlap"):
         aside = replace(camera, position=(camera.position[0] + 1.0, *camera.position[1:]))
-        fit_film(thing, clip, aside, HELD, material=unknown, plate=plate)
+        fit_film(thing, clip, aside, material=unknown, plate=plate)
 
 
 def test_least_squares() -> None:
