@@ -21,14 +21,18 @@ from softmode.fitting.film import Clip
 from softmode.fitting.film_fit import fit_film
 from softmode.fitting.holding import Held, held_object
 from softmode.fitting.least_squares import Space, minimise
-from softmode.objects import SoftObject, load
+from softmode.objects import ObjectConfig, SoftObject, load
+from softmode.objects.object_file import stored_bars
 from softmode.splats.colored_mesh import ColoredMesh
+from softmode.splats.raster.pinhole import PinholeCamera
 from tests.fitting.films import Trouble, make_film
 from tests.needs import needs
 
 pytestmark = needs("cv2")
 TRUE = Material(youngs_modulus=9.0e4, viscosity=5.0e-3, poissons_ratio=0.35, density=300.0)
 HELD = Held.parse("-x:0.03")
+EXPOSURE = 0.8 / 30.0
+"""For how long a frame of the film sees [s]."""
 
 
 @functools.cache
@@ -42,16 +46,34 @@ def bar(functions: int) -> SoftObject:
     return held_object(load(ColoredMesh.from_trimesh(mesh), build=made, material=TRUE, **told), HELD)
 
 
+@functools.cache
+def film() -> tuple[Clip, np.ndarray, PinholeCamera]:
+    """Return a film of the bar with all troubles, and an exposure of nearly a frame; its plate; the camera as told."""
+    trouble = Trouble(blur=EXPOSURE * 30.0)
+    frames, plate, camera = make_film(bar(36), TRUE, trouble, seed=5, seconds=0.6, size=96)
+    return Clip(frames=frames, times=np.arange(len(frames)) / 30.0), plate, camera
+
+
 def test_film(tmp_path: Path) -> None:
     """E is within two bars and 8 % of the truth with all troubles at once, and comes back with the twin's file.
 
-    A fit that was cut off goes on where it was, and ends with the same bits.
+    A fit that was cut off goes on where it was, and ends with the same bits. What is asked for besides is found or
+    said not to be.
     """
-    frames, plate, camera = make_film(bar(36), TRUE, Trouble(), seed=5, seconds=0.6, size=96)
-    clip = Clip(frames=frames, times=np.arange(len(frames)) / 30.0)
+    clip, plate, camera = film()
     thing = bar(24)
     unknown = replace(TRUE, youngs_modulus=1.0e5, viscosity=0.0)
-    found, residuals, _ = fit_film(thing, clip, camera, material=unknown, plate=plate)
+    fit = functools.partial(
+        fit_film,
+        thing,
+        clip,
+        camera,
+        material=unknown,
+        plate=plate,
+        exposure=EXPOSURE,
+        free=["poissons_ratio", "density"],
+    )
+    found, residuals, _ = fit()
     modulus = found["youngs_modulus"]
     error = np.log(modulus.value / TRUE.youngs_modulus)
     assert modulus.observable and abs(error) < min(0.08, 2.0 * np.log(modulus.high / modulus.value))
@@ -62,7 +84,10 @@ def test_film(tmp_path: Path) -> None:
     found.save(tmp_path / "toy.npz", thing)
     again = load(tmp_path / "toy.npz")
     assert again.material is not None and again.material.youngs_modulus == pytest.approx(modulus.value)
-    assert json.loads(str(again.body.provenance["fit_bars"]))["youngs_modulus"] == [modulus.low, modulus.high]
+    assert stored_bars(again.body)["youngs_modulus"] == (modulus.low, modulus.value, modulus.high)
+    assert "weigh" in found["density"].reason and not found["poissons_ratio"].observable
+    told = ObjectConfig(body=tmp_path / "toy.npz").pinned().fitted
+    assert told is not None and json.loads(told)["parameters"]["youngs_modulus"][1] == modulus.value
 
     def cut(stage: str, fraction: float) -> None:
         if stage == "fitting with tracks":
@@ -70,13 +95,38 @@ def test_film(tmp_path: Path) -> None:
 
     part = tmp_path / "part.json"
     with pytest.raises(KeyboardInterrupt):
-        fit_film(thing, clip, camera, material=unknown, plate=plate, keep=part, progress=cut)
-    gone_on, late, _ = fit_film(thing, clip, camera, material=unknown, plate=plate, keep=part)
+        fit(keep=part, progress=cut)
+    gone_on, late, _ = fit(keep=part)
     assert gone_on.estimates == found.estimates and not part.exists()
     assert late.worlds.steps < 0.6 * residuals.worlds.steps
-    with pytest.raises(FitError, match="overlap"):
-        aside = replace(camera, position=(camera.position[0] + 1.0, *camera.position[1:]))
-        fit_film(thing, clip, aside, material=unknown, plate=plate)
+
+
+@pytest.mark.parametrize(
+    ("what", "match"), [("camera", "overlap"), ("object", "overlap"), ("size", "overlap"), ("rigid", "held moves")]
+)
+def test_films_of_something_else(what: str, match: str) -> None:
+    """A camera, an object or a size that is not the film's, and what moves as a whole, are refused with a picture."""
+    clip, plate, camera = film()
+    thing = bar(24)
+    if what == "camera":
+        camera = replace(camera, position=(camera.position[0] + 1.0, *camera.position[1:]))
+    if what == "object":
+        mesh: Any = trimesh.creation.box((0.2, 0.2, 0.02))
+        told = {"size": 0.2, "splat_count": 600, "surface_count": 60, "pose": "captured"}
+        made = BuildOptions(function_count=12, kernel_count=100, cubature_count=64)
+        thing = held_object(load(ColoredMesh.from_trimesh(mesh), build=made, material=TRUE, **told), HELD)
+    if what == "size":
+        camera = replace(camera, position=tuple(1.6 * np.array(camera.position)))
+    if what == "rigid":
+        shift = [0 if k < 6 else round(8.0 * abs(np.sin(0.7 * (k - 5)))) for k in range(len(clip.frames))]
+        moved = np.array([np.roll(clip.frames[0], k, axis=0) for k in shift])
+        still = np.abs(clip.frames[0].astype(int) - plate).max(axis=2, keepdims=True) < 24
+        gone = np.array([np.roll(still, k, axis=0) for k in shift])
+        noise = np.random.default_rng(0).normal(0.0, 5.0, moved.shape)
+        clip = replace(clip, frames=np.clip(np.where(gone, plate, moved) + noise, 0, 255).astype(np.uint8))
+    with pytest.raises(FitError, match=match) as caught:
+        fit_film(thing, clip, camera, material=TRUE, plate=plate)
+    assert caught.value.hint and caught.value.picture.shape == (96, 288, 3)
 
 
 def test_least_squares() -> None:
