@@ -197,7 +197,7 @@ def run(
     filmed = {"fps": case.fps, "size": case.pixels, "azimuth": case.azimuth, "seconds": seconds or case.seconds}
     frames, plate, camera = make_film(truth, made, trouble, case.seed, moved=moved, dt=dt, **filmed)
     density = made.density * truth.body.volume / thing.body.volume  # the mass is weighed
-    clip = Clip(frames=frames, times=np.arange(len(frames)) / case.fps, name=case.name)
+    clip = Clip(frames=frames, times=np.arange(len(frames)) / case.fps, source=case.name)
     start, wall = time.process_time(), time.perf_counter()
 
     def tell(stage: str, fraction: float) -> None:

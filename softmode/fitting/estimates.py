@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -85,10 +85,11 @@ def asked_for(
     return found
 
 
-def made_of(material: Material, estimates: Mapping[str, Estimate]) -> Material:
-    """Return a material with the numbers of it that are observable."""
-    names = [name for name, one in estimates.items() if one.observable and hasattr(material, name)]
-    return replace(material, **{name: estimates[name].value for name in names})
+class Recorded(Protocol):
+    """A film, markers or a force log."""
+
+    source: str
+    fingerprint: str
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -107,6 +108,16 @@ class Fitted:
     """What the user should know."""
     details: dict[str, Any] = field(default_factory=dict)
     """Camera, start, residual of each frame, costs: as JSON holds them."""
+
+    @classmethod
+    def of(
+        cls, data: Recorded, estimates: dict[str, Estimate], told: Material, notes: Sequence[str], **details: Any
+    ) -> Fitted:
+        """Return what was found of data; the material is what was told, with the numbers that are observable."""
+        names = [name for name, one in estimates.items() if one.observable and hasattr(told, name)]
+        found = {"material": replace(told, **{name: estimates[name].value for name in names}), "notes": tuple(notes)}
+        about = {"source": data.source, "fingerprint": data.fingerprint}
+        return cls(estimates=estimates, details=details, **about, **found)
 
     def __getitem__(self, name: str) -> Estimate:
         """Return an estimate."""

@@ -41,7 +41,7 @@ class Clip:
     """RGB, shape (F, H, W, 3)."""
     times: Array
     """Of the frames, from the first [s], shape (F,)."""
-    name: str = "film"
+    source: str = "film"
     """What messages call it."""
     fingerprint: str = ""
     """sha256 of its file."""
@@ -65,7 +65,7 @@ class Clip:
             cover: What covers the background, 0..1, shape (F, H, W); drawn red.
             twin: Where the object should be, 0..1, shape (H, W); drawn blue.
         """
-        error = FitError(f"film {self.name}: {what}", hint=hint)
+        error = FitError(f"film {self.source}: {what}", hint=hint)
         if len(self.frames):
             off = np.abs(self.frames.astype(np.float32) - self.frames[0]).mean(axis=(1, 2, 3))
             shown = [0, int(off.argmax()), len(self.frames) - 1]
@@ -123,13 +123,8 @@ class Clip:
         if fps_true is not None:
             require_number("fps_true", fps_true, above=0.0, at_most=1.0e5, hint="give frames per second, like 240")
             times = times / (np.median(np.diff(times)) if len(times) > 1 else 1.0) / fps_true
-        return cls(
-            frames=np.array(frames),
-            times=times,
-            name=str(path),
-            fingerprint=file_fingerprint(path),
-            shrink=shrink,
-        )
+        told = {"source": str(path), "fingerprint": file_fingerprint(path)}
+        return cls(frames=np.array(frames), times=times, shrink=shrink, **told)
 
 
 def _video(path: Path) -> Any:

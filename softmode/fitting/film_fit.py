@@ -14,7 +14,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from softmode.deformables.materials.material import Material
-from softmode.fitting.estimates import Estimate, Fitted, asked_for, floor_of, made_of
+from softmode.fitting.estimates import Estimate, Fitted, asked_for, floor_of
 from softmode.fitting.film import Clip, Image, blurred, find_mattes, open_cv
 from softmode.fitting.film_residuals import CAMERA, HOLDER, NAMES, START, FilmResiduals, film_space
 from softmode.fitting.kept import KeptStages
@@ -155,7 +155,7 @@ def fit_film(
     )
     x = best.x.copy()
     x[:2] -= shift
-    told = _told(thing, clip, best, x, residuals, material, followed, free)
+    told = _told(residuals, best, x, material, followed, free)
     details = {
         "converged": best.converged,
         "camera": dict(zip(_POSE, best.x[CAMERA].tolist(), strict=True)) | {"nominal": asdict(camera)},
@@ -192,17 +192,10 @@ def _check_grip(residuals: FilmResiduals, area: NDArray[np.bool_], twin: NDArray
 
 
 def _told(
-    thing: SoftObject,
-    clip: Clip,
-    best: Solution,
-    x: Array,
-    residuals: FilmResiduals,
-    material: Material,
-    followed: float,
-    free: Sequence[str],
+    residuals: FilmResiduals, best: Solution, x: Array, material: Material, followed: float, free: Sequence[str]
 ) -> Fitted:
     """Return what is told of a solution, with bars."""
-    space = best.space
+    thing, clip, space = residuals.thing, residuals.clip, best.space
     deviation = dict(zip((NAMES[k] for k in best.free), best.deviations(residuals.blocks()).tolist(), strict=True))
     bar = float(np.hypot(deviation["youngs_modulus"] / max(followed, 0.01), floor_of(thing)))
     at_end = min(x[0] - space.low[0], space.high[0] - x[0]) < 0.2
@@ -220,13 +213,7 @@ def _told(
         )
     estimates = {"youngs_modulus": modulus, "viscosity": viscosity}
     estimates |= asked_for(free, material, space, x, deviation)
-    return Fitted(
-        source=clip.name,
-        fingerprint=clip.fingerprint,
-        estimates=estimates,
-        material=made_of(material, estimates),
-        notes=tuple(notes),
-    )
+    return Fitted.of(clip, estimates, material, notes)
 
 
 def _compared(residuals: FilmResiduals, x: Array, cover: Array) -> tuple[Array, float, Any]:

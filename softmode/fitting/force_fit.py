@@ -23,7 +23,7 @@ from softmode.deformables.model.status import (
 )
 from softmode.deformables.model.tables import present
 from softmode.errors import ConfigError, FitError, SolverDiverged
-from softmode.fitting.estimates import Estimate, Fitted, floor_of, made_of
+from softmode.fitting.estimates import Estimate, Fitted, floor_of
 from softmode.fitting.tables import ForceLog
 from softmode.fitting.worlds import FitWorlds
 from softmode.objects.frame import in_body
@@ -73,7 +73,7 @@ class Press:
         """
         low, high = body.surface.points.min(axis=0), body.surface.points.max(axis=0)
         wide = 2.0 * float((high - low).max())
-        world = newton.ModelBuilder()
+        world, builder = newton.ModelBuilder(), newton.ModelBuilder()
         add_reduced_body(world, body, material=replace(material, mass_damping=20.0))
         press = world.add_body(is_kinematic=True, xform=wp.transform((0.0, 0.0, 10.0 * wide), wp.quat_identity()))
         config = newton.ModelBuilder.ShapeConfig(mu=1.0)
@@ -87,7 +87,8 @@ class Press:
         else:
             start, toward = low + high - behind, -axis
             world.add_shape_box(press, **plate)
-        worlds = FitWorlds(world, body, len(depths), dt=STEP, device=device)
+        builder.replicate(world, len(depths))
+        worlds = FitWorlds(builder.finalize(device=device), body, dt=STEP)
         # the file has the object as it rests, and forces are those beyond its weight
         worlds.model.set_gravity((0.0, 0.0, 0.0))
         poses = present(worlds.states[0].body_q).numpy()
@@ -180,9 +181,8 @@ def fit_force(
     modulus = START * factor
     inverse = np.linalg.inv(found.jac.T @ found.jac)
     spread = float(np.sqrt(inverse[0, 0] * max(2.0 * found.cost / max(len(way) - 2, 1), 0.1)))
-    estimate = Estimate.of_logarithm(
-        np.log(modulus), float(np.hypot(spread, floor_of(thing) if press.point is None else BALL)), unit="Pa"
-    )
+    bar = float(np.hypot(spread, floor_of(thing) if press.point is None else BALL))
+    estimate = Estimate.of_logarithm(np.log(modulus), bar, unit="Pa")
     curve = factor * _curve(depths, made, way - shift)
     shallow, deep = (
         modulus * float(force[part].sum() / max(curve[part].sum(), 1e-12))
@@ -195,11 +195,5 @@ def fit_force(
             f"no single E fits: {shallow / 1e3:.3g} kPa when it is pressed a little, {deep / 1e3:.3g} kPa at the end,"
             f" as {law} does"
         )
-    return Fitted(
-        source=log.source,
-        fingerprint=log.fingerprint,
-        estimates={"youngs_modulus": estimate},
-        material=made_of(material, {"youngs_modulus": estimate}),
-        notes=tuple(notes),
-        details={"depths": depths.tolist(), "forces": (factor * made).tolist(), "touch": shift},
-    )
+    details = {"depths": depths.tolist(), "forces": (factor * made).tolist(), "touch": shift}
+    return Fitted.of(log, {"youngs_modulus": estimate}, material, notes, **details)

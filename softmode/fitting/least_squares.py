@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -134,42 +135,24 @@ def minimise(
                 slopes[:, rows] = fresh
             latest[:] = [slopes]
             known.clear()
-            known[key] = (
-                np.append(found[0], (y - mean) / prior),
-                np.vstack([slopes, np.diag(1.0 / prior)]),
-            )
+            known[key] = np.append(found[0], (y - mean) / prior), np.vstack([slopes, np.diag(1.0 / prior)])
             counted.append(1)
         return known[key]
 
     counted: list[int] = []
     latest: list[Array] = []
     lasts = np.isin(np.array(free), lasting)
-    found = least_squares(
-        lambda y: batch(y)[0],
-        np.clip(start[which], space.low[which] + 1e-9, space.high[which] - 1e-9),
-        jac=lambda y: batch(y)[1],  # type: ignore[arg-type]
-        bounds=(space.low[which], space.high[which]),
-        loss="huber",
-        f_scale=HUBER,
-        x_scale=np.where(np.isfinite(prior), prior, 1.0),
-        ftol=TOLERANCE,
-        xtol=TOLERANCE,
-        max_nfev=rounds,
-    )
+    low, high, scale = space.low[which], space.high[which], np.where(np.isfinite(prior), prior, 1.0)
+    how: dict[str, Any] = {"loss": "huber", "f_scale": HUBER, "ftol": TOLERANCE, "xtol": TOLERANCE, "max_nfev": rounds}
+    begin = np.clip(start[which], low + 1e-9, high - 1e-9)
+    how |= {"jac": lambda y: batch(y)[1], "bounds": (low, high), "x_scale": scale}
+    found = least_squares(lambda y: batch(y)[0], begin, **how)
     r, J = batch(found.x)
     x = start.copy()
     x[which] = found.x
     m = len(r) - len(which)
-    return Solution(
-        space=space,
-        x=x,
-        free=which,
-        converged=found.status > 0,
-        cost=float(found.cost),
-        residuals=r[:m],
-        jacobian=J[:m],
-        prior=prior,
-    )
+    told: dict[str, Any] = {"converged": found.status > 0, "cost": float(found.cost)}
+    return Solution(space=space, x=x, free=which, residuals=r[:m], jacobian=J[:m], prior=prior, **told)
 
 
 def cost_of(residuals: Array) -> Array:

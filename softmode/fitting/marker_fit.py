@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from softmode.deformables.materials.material import Material
 from softmode.errors import ConfigError, FitError
-from softmode.fitting.estimates import Estimate, Fitted, asked_for, made_of
+from softmode.fitting.estimates import Estimate, Fitted, asked_for
 from softmode.fitting.film_fit import SPECIFIC
 from softmode.fitting.least_squares import Solution, Space, cost_of, minimise
 from softmode.fitting.tables import Markers
@@ -96,14 +96,19 @@ class MarkerFit:
             name = list(places.points)[int(off.argmax())]
             raise ConfigError(f"marker {name} lies {off.max():.3g} m from the object", hint="check places and --size")
         self._basis = body.evaluate(rest)[0]
-        self._load: Array | None = None
+        self._load = np.zeros((body.surface_count, 3))
         if any(places.load):
             if places.load_at is None:
                 raise ConfigError("load hangs nowhere", hint='say where: "load": {"force": [...], "at": [x, y, z]}')
             at = in_body(body, places.load_at)
             near = np.argsort(np.linalg.norm(body.surface.points - at, axis=1))[:LOADED]
-            self._load = np.zeros((body.surface_count, 3))
             self._load[near] = np.array(places.load) / len(near)
+
+    def _worlds(self, count: int, dt: float) -> HeldWorlds:
+        """Return worlds of the object with the load on it."""
+        worlds = HeldWorlds(self.thing.body, self.material, count, dt=dt, device=self._device)
+        worlds.hang(self._load)
+        return worlds
 
     def moved(self, markers: Markers) -> Array:
         """Return how far the markers are from where they were before the release [m], (F, M, 3), in the object's axes.
@@ -118,7 +123,7 @@ class MarkerFit:
     def sag(self, moduli: ArrayLike) -> Array:
         """Return where the markers rest under gravity and the load, for each Young's modulus [m], (W, M, 3)."""
         moduli = np.atleast_1d(np.asarray(moduli, float))
-        worlds = HeldWorlds(self.thing.body, self.material, len(moduli), dt=0.05, load=self._load, device=self._device)
+        worlds = self._worlds(len(moduli), 0.05)
         q = worlds.run({"youngs_modulus": moduli, "viscosity": 0.05}, 8.0, every=160)[1]
         return np.einsum("mk,wkc->wmc", self._basis, q[-1] - q[0])
 
@@ -148,9 +153,7 @@ class MarkerFit:
         last = min(len(moved) - 1, int(np.searchsorted(markers.times, release + 1.5)))
         frames = np.arange(markers.release, last + 1)
         times, noise = markers.times[frames], max(markers.noise, 2.0e-4)
-        worlds = HeldWorlds(
-            self.thing.body, self.material, 5 + len(free), dt=STEP, load=self._load, device=self._device
-        )
+        worlds = self._worlds(5 + len(free), STEP)
         interval = float(np.median(np.diff(markers.times)))
         start = (release, 2.0 * interval, 0.002, release - 0.05, release + 0.05)
         space = Space.of({**physics_rows(self.material), "start": start})
@@ -219,11 +222,4 @@ def fit_markers(
             notes.append(f"{word} in motion by {abs(stiffer):.0%}: the material is rate dependent")
     viscosity = Estimate.of_logarithm(x[1], float(np.hypot(deviation["viscosity"], 0.1)), unit="s")
     estimates |= {"viscosity": viscosity} | asked_for(free, material, best.space, x, deviation)
-    return Fitted(
-        source=markers.source,
-        fingerprint=markers.fingerprint,
-        estimates=estimates,
-        material=made_of(material, estimates),
-        notes=tuple(notes),
-        details={"start": float(x[-1]), "rms": left},
-    )
+    return Fitted.of(markers, estimates, material, notes, start=float(x[-1]), rms=left)

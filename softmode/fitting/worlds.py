@@ -44,34 +44,22 @@ def physics_rows(material: Material) -> dict[str, tuple[float, ...]]:
 
 
 class FitWorlds:
-    """Worlds of one body that are stepped together.
+    """Worlds of one body that are stepped together, two steps a launch.
 
     Args:
-        world: One of them.
-        body: Its body.
-        count: Number of worlds.
+        model: The worlds.
+        body: The body.
         dt: Step [s].
         options: Of the solver.
-        device: Warp device.
     """
 
     def __init__(
-        self,
-        world: newton.ModelBuilder,
-        body: ReducedBody,
-        count: int,
-        *,
-        dt: float,
-        options: SolverReducedOptions | None = None,
-        device: wp.DeviceLike = None,
+        self, model: newton.Model, body: ReducedBody, *, dt: float, options: SolverReducedOptions | None = None
     ) -> None:
-        """Allocate the worlds."""
-        builder = newton.ModelBuilder()
-        builder.replicate(world, count)
-        self.body, self.count, self.dt = body, count, dt
-        self.model = builder.finalize(device=device)
-        self.solver = SolverReduced(self.model, [body], options=options)
-        self.states, self._control = (self.model.state(), self.model.state()), self.model.control()
+        """Allocate the states."""
+        self.model, self.body, self.count, self.dt = model, body, model.world_count, dt
+        self.solver = SolverReduced(model, [body], options=options)
+        self.states, self._control = (model.state(), model.state()), model.control()
         self._graph: Callable[[], None] | None = None
 
     def reset(self) -> None:
@@ -103,29 +91,25 @@ class HeldWorlds(FitWorlds):
         material: What is the same in all worlds.
         count: Number of worlds.
         dt: Step [s].
-        load: Force on each surface sample [N], shape (surface_count, 3); None for none.
         device: Warp device.
     """
 
     def __init__(
-        self,
-        body: ReducedBody,
-        material: Material,
-        count: int,
-        *,
-        dt: float,
-        load: Array | None = None,
-        device: wp.DeviceLike = None,
+        self, body: ReducedBody, material: Material, count: int, *, dt: float, device: wp.DeviceLike = None
     ) -> None:
         """Allocate the worlds."""
-        world = newton.ModelBuilder()
+        world, builder = newton.ModelBuilder(), newton.ModelBuilder()
         add_reduced_body(world, body, material=material)
-        super().__init__(world, body, count, dt=dt, options=SolverReducedOptions(integrator="bdf2"), device=device)
+        builder.replicate(world, count)
+        model = builder.finalize(device=device)
+        super().__init__(model, body, dt=dt, options=SolverReducedOptions(integrator="bdf2"))
         self.steps = 0
         """Steps of worlds so far."""
-        if load is not None:
-            for state in self.states:
-                present(state.particle_f).assign(np.tile(load, (count, 1)).astype(np.float32))
+
+    def hang(self, load: Array) -> None:
+        """Let forces pull at the surface samples [N], shape (surface_count, 3)."""
+        for state in self.states:
+            present(state.particle_f).assign(np.tile(load, (self.count, 1)).astype(np.float32))
 
     def run(
         self,

@@ -43,8 +43,10 @@ from softmode.envs.tasks.place_in_bin.task import PlaceInBin
 from softmode.envs.tasks.rope_route.task import RopeRoute, rope_scene
 from softmode.envs.tasks.shape_soft.config import POST
 from softmode.errors import ConfigError, GraspError, StateError
+from softmode.fitting.estimates import Estimate, Fitted
+from softmode.fitting.tables import ForceLog
 from softmode.learning.config_values import config_of, pinned_options, values_of
-from softmode.objects import ObjectConfig, ObjectSet
+from softmode.objects import ObjectConfig, ObjectSet, load
 from softmode.scenes import BoundSplats
 from softmode.splats import make_plush, write_splats
 from tests.envs.object_kinds import (
@@ -309,6 +311,21 @@ def test_runs_keep_the_set(tmp_path: Path) -> None:
     pinned = pinned_options("softmode/LiftSoft-v0", options)
     found = config_of(LiftSoftConfig, json.loads(json.dumps(pinned["config"]))).object_set
     assert found is not None and found.config(1).fingerprint == ObjectConfig(splat=file).pinned().fingerprint
+
+
+def test_a_fitted_object_has_a_modulus_within_its_bars(tmp_path: Path) -> None:
+    """E of what `softmode fit` made is drawn within its bars, and other objects keep theirs; JSON of it tells the fit."""
+    modulus = Estimate(value=5.0e4, low=4.0e4, high=6.25e4, observable=True, unit="Pa")
+    film = ForceLog(way=np.zeros(1), force=np.zeros(1), opening=False, source="press.csv", fingerprint="00ff")
+    Fitted.of(film, {"youngs_modulus": modulus}, MATERIALS[0], ()).save(tmp_path / "toy.npz", load(CUBE))
+    toy = ObjectConfig(body=tmp_path / "toy.npz")
+    env = LiftSoftVectorEnv(4, config=lift(ObjectSet([toy, BALL], order="in_turn")), device="cpu")
+    drawn = np.array([env.reset(seed=seed)[1]["parameters"]["youngs_modulus"] for seed in (1, 20)])
+    fitted, other = drawn.reshape(2, 4)[:, ::2], drawn.reshape(2, 4)[:, 1::2]
+    assert (fitted >= modulus.low).all() and (fitted <= modulus.high).all() and len(np.unique(fitted)) == 4
+    assert len(np.unique(other)) == 1
+    told = json.loads(values_of(lift(ObjectSet([toy.pinned()])))["objects"]["objects"][0]["fitted"])
+    assert told["fingerprint"] == "00ff" and told["parameters"]["youngs_modulus"] == [4.0e4, 5.0e4, 6.25e4]
 
 
 def test_scripted_policies_take_each_object() -> None:
