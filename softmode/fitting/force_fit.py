@@ -91,12 +91,12 @@ class Press:
         worlds = FitWorlds(builder.finalize(device=device), body, dt=STEP)
         # the file has the object as it rests, and forces are those beyond its weight
         worlds.model.set_gravity((0.0, 0.0, 0.0))
-        poses = present(worlds.states[0].body_q).numpy()
+        poses = present(worlds.pair[0].body_q).numpy()
         poses[:, 3:] = (0.0, 0.0, 0.0, 1.0)
 
         def place(share: float) -> None:
             poses[:, :3] = start + toward * (share * depths)[:, None]
-            for state in worlds.states:
+            for state in worlds.pair:
                 present(state.body_q).assign(poses)
 
         place(0.0)

@@ -59,7 +59,7 @@ class FitWorlds:
         """Allocate the states."""
         self.model, self.body, self.count, self.dt = model, body, model.world_count, dt
         self.solver = SolverReduced(model, [body], options=options)
-        self.states, self._control = (model.state(), model.state()), model.control()
+        self.pair, self._control = (model.state(), model.state()), model.control()
         self._graph: Callable[[], None] | None = None
 
     def reset(self) -> None:
@@ -67,7 +67,7 @@ class FitWorlds:
         if self._graph is None:
             self._graph = capture_graph(self._two_steps, self.model.device).launch
         self.solver.status.zero_()
-        for state in self.states:
+        for state in self.pair:
             self.solver.reset(state)
             set_states(self.solver, state)
 
@@ -78,7 +78,7 @@ class FitWorlds:
 
     def _two_steps(self) -> None:
         """Step from one state to the other and back."""
-        for a, b in (self.states, self.states[::-1]):
+        for a, b in (self.pair, self.pair[::-1]):
             self.solver.step(a, b, self._control, None, self.dt)
 
 
@@ -108,7 +108,7 @@ class HeldWorlds(FitWorlds):
 
     def hang(self, load: Array) -> None:
         """Let forces pull at the surface samples [N], shape (surface_count, 3)."""
-        for state in self.states:
+        for state in self.pair:
             present(state.particle_f).assign(np.tile(load, (self.count, 1)).astype(np.float32))
 
     def run(
@@ -145,7 +145,7 @@ class HeldWorlds(FitWorlds):
         count, size = round(seconds / (self.dt * every)), (self.count, self.body.function_count, 3)
         found = np.empty((count + 1, worlds, *size[1:]))
         for k in range(count + 1):
-            found[k] = soft(self.states[0]).q.numpy().reshape(size)[:worlds]
+            found[k] = soft(self.pair[0]).q.numpy().reshape(size)[:worlds]
             if k < count:
                 for _ in range(every // 2):
                     self.step_twice()

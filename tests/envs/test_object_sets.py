@@ -314,7 +314,7 @@ def test_runs_keep_the_set(tmp_path: Path) -> None:
 
 
 def test_a_fitted_object_has_a_modulus_within_its_bars(tmp_path: Path) -> None:
-    """E of what `softmode fit` made is drawn within its bars, other objects keep theirs; its configuration tells all."""
+    """E of what `softmode fit` made is drawn within its bars, others keep theirs; its configuration tells all."""
     modulus = Estimate(value=5.0e4, low=4.0e4, high=6.25e4, observable=True, unit="Pa")
     film = ForceLog(way=np.zeros(1), force=np.zeros(1), opening=False, source="press.csv", fingerprint="00ff")
     Fitted.of(film, {"youngs_modulus": modulus}, MATERIALS[0], ()).save(tmp_path / "toy.npz", load(CUBE))
