@@ -148,9 +148,8 @@ class Fitted:
             found.append(f"{title}: {value}" if one.observable else f"{title}: not observable, because {one.reason}")
         for name, one in self.estimates.items():
             if not one.observable and hasattr(self.material, name):
-                found.append(
-                    f"the twin keeps {name} = {getattr(self.material, name):.3g} {one.unit}, which was not found"
-                )
+                kept = f"{name} = {getattr(self.material, name):.3g} {one.unit}"
+                found.append(f"the twin keeps {kept}, which was not found")
         return [*found, *self.notes]
 
     def write(self, path: Path) -> None:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from softmode.checks import require_number
 from softmode.errors import AssetError, FitError, needs_extra
+from softmode.files import damage_errors
 from softmode.objects.fingerprint import file_fingerprint
 
 Array = NDArray[np.float64]
@@ -56,7 +57,7 @@ class Clip:
         if not (np.diff(self.times) > 0.0).all():
             raise self.refused("its times do not increase", hint="export it again at a constant rate")
 
-    def refused(self, what: str, *, hint: str, cover: Array | None = None, twin: Any = None) -> FitError:
+    def refused(self, what: str, *, hint: str, cover: Array | None = None, twin: Array | None = None) -> FitError:
         """Return the error that says what is wrong, with a picture: the first frame, the most different one, the last.
 
         Args:
@@ -68,10 +69,10 @@ class Clip:
         error = FitError(f"film {self.source}: {what}", hint=hint)
         if len(self.frames):
             off = np.abs(self.frames.astype(np.float32) - self.frames[0]).mean(axis=(1, 2, 3))
-            shown = [0, int(off.argmax()), len(self.frames) - 1]
-            error.picture = np.concatenate(
-                [outlined(self.frames[k], None if cover is None else cover[k], twin) for k in shown], axis=1
-            )
+            none = np.zeros(self.frames.shape[:3])
+            red, blue = none if cover is None else cover, none[0] if twin is None else twin
+            shown = [outlined(self.frames[k], red[k], blue) for k in (0, int(off.argmax()), -1)]
+            error.picture = np.concatenate(shown, axis=1)
         return error
 
     @property
@@ -145,7 +146,7 @@ def _gif(path: Path) -> Any:
     from PIL import ImageSequence
 
     time = 0.0
-    with Picture.open(path) as file:
+    with damage_errors(f"film {path}", hint="export it again"), Picture.open(path) as file:
         for frame in ImageSequence.Iterator(file):
             yield time, np.asarray(frame.convert("RGB"))
             time += 1.0e-3 * max(float(frame.info.get("duration", 100.0)), 10.0)
@@ -240,14 +241,13 @@ def _check_alone(clip: Clip, cover: Array) -> None:
         raise clip.refused("two things move", hint="film one object, before a background at rest", cover=cover)
 
 
-def outlined(frame: Image, cover: Any, twin: Any) -> Image:
-    """Return a frame with the rim of what covers it in red and that of the object in blue; None draws neither."""
+def outlined(frame: Image, cover: Array, twin: Array) -> Image:
+    """Return a frame with the rim of what covers it in red and that of the object in blue."""
     picture = frame.copy()
     for area, color in ((cover, (255, 0, 0)), (twin, (0, 0, 255))):
-        if area is not None:
-            cv2 = open_cv()
-            inner = (area > 0.5).astype(np.uint8)
-            picture[cv2.dilate(inner, np.ones((3, 3))) > inner] = color
+        inner = np.pad(area > 0.5, 1)
+        rim = inner[2:, 1:-1] | inner[:-2, 1:-1] | inner[1:-1, 2:] | inner[1:-1, :-2]
+        picture[rim & ~inner[1:-1, 1:-1]] = color
     return picture
 
 

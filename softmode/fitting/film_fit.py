@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from softmode.deformables.materials.material import Material
 from softmode.fitting.estimates import Estimate, Fitted, asked_for, floor_of
 from softmode.fitting.film import Clip, Image, blurred, find_mattes, open_cv
-from softmode.fitting.film_residuals import CAMERA, HOLDER, NAMES, START, FilmResiduals, film_space
+from softmode.fitting.film_residuals import CAMERA, HOLDER, NAMES, START, STEP, FilmResiduals, film_space
 from softmode.fitting.kept import KeptStages
 from softmode.fitting.least_squares import Solution, Space, cost_of, minimise
 from softmode.fitting.pictures import project
@@ -92,9 +92,9 @@ def fit_film(
     mattes = find_mattes(clip, plate)
     tracks = follow(clip, mattes.cover)
     placed = replace(camera, position=tuple(np.subtract(camera.position, thing.body.offset).tolist()))
-    more = [name for name in free if name in FREE]
-    names = [name for name in NAMES if name not in FREE or name in more]
-    residuals = FilmResiduals(thing, material, clip, mattes, placed, exposure=exposure, free=len(more), device=device)
+    names = [name for name in NAMES if name not in FREE or name in free]
+    more = len(names) - len(NAMES) + len(FREE)
+    residuals = FilmResiduals(thing, material, clip, mattes, placed, exposure=exposure, free=more, device=device)
     residuals.after = lambda: tell(done[0], min(done[1] + 0.01, 0.99))
     every, release = residuals.frames, float(clip.times[mattes.release])
     space = film_space(release - 0.25 * clip.interval, clip.interval, material)
@@ -150,9 +150,7 @@ def fit_film(
         what = f"not observable, because the twin needs {name} off by {beyond:.0f} times its prior"
         raise clip.refused(what, hint=f"check camera, size and --held; {hint}", cover=mattes.cover, twin=twin)
     tell("the integrator's share", 0.95)
-    shift = integrator_shift(
-        thing, material, best.x, float(clip.times[-1] - best.x[START]), residuals.worlds.dt, device
-    )
+    shift = integrator_shift(thing, material, best.x, float(clip.times[-1] - best.x[START]), device)
     x = best.x.copy()
     x[:2] -= shift
     told = _told(residuals, best, x, material, followed, free)
@@ -261,9 +259,7 @@ def first_frequency(thing: SoftObject, youngs_modulus: float, material: Material
     return 0.1615 * float(span[0]) / float(span[2]) ** 2 * float(np.sqrt(youngs_modulus / material.density))
 
 
-def integrator_shift(
-    thing: SoftObject, material: Material, x: Array, seconds: float, dt: float, device: wp.DeviceLike
-) -> Array:
+def integrator_shift(thing: SoftObject, material: Material, x: Array, seconds: float, device: wp.DeviceLike) -> Array:
     """Return by how much ln E and ln viscosity come out too large because of the steps, (2,).
 
     With steps of a quarter the body moves as it does with these steps and a little more of both; by how much is found
@@ -271,7 +267,7 @@ def integrator_shift(
     """
     rows = thing.body.surface.basis[:: max(1, thing.body.surface_count // 60)]
 
-    times = np.arange(0.0, seconds, 4.0 * dt)
+    times = np.arange(0.0, seconds, 4.0 * STEP)
 
     def motion(sets: Array, step: float) -> Array:
         worlds = HeldWorlds(thing.body, material, len(sets), dt=step, device=device)
@@ -280,8 +276,7 @@ def integrator_shift(
 
     sets = np.repeat(x[None, : len(PHYSICS)], 3, axis=0)
     steps = np.array([0.02, 0.1])
-    sets[1, 0] += steps[0]
-    sets[2, 1] += steps[1]
-    coarse, fine = motion(sets, dt), motion(sets[:1], dt / 4.0)
+    sets[[1, 2], [0, 1]] += steps
+    coarse, fine = motion(sets, STEP), motion(sets[:1], STEP / 4.0)
     slopes = (coarse[1:] - coarse[0]) / steps[:, None]
     return np.linalg.lstsq(slopes.T, fine[0] - coarse[0], rcond=None)[0]

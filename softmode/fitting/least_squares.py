@@ -79,7 +79,8 @@ class Solution:
         """Return standard deviations of the free parameters, (k,).
 
         Of two the larger: that of Gauss and Newton with the priors, times chi where it is above one, and that of the
-        sandwich over blocks of residuals which may err together (White 1980, doi:10.2307/1912934).
+        sandwich over blocks of residuals which may err together (White 1980, doi:10.2307/1912934). Where the search
+        ended before the least cost, the step that is left to it counts as an error too.
 
         Args:
             blocks: Indices of residuals.
@@ -92,7 +93,9 @@ class Solution:
         chi = float((w * r * r)[active].sum() / max(int(active.sum()) - len(self.free), 1))
         scores = np.array([J[b].T @ (w * r)[b] for b in blocks])
         sandwich = inverse @ (scores.T @ scores + np.diag(1.0 / self.prior**2)) @ inverse
-        return np.sqrt(np.maximum(np.diag(inverse) * max(chi, 1.0), np.diag(sandwich)))
+        away = (self.x - self.space.mean)[self.free] / self.prior**2
+        left = inverse @ (J.T @ (w * r) + away)
+        return np.hypot(np.sqrt(np.maximum(np.diag(inverse) * max(chi, 1.0), np.diag(sandwich))), left)
 
 
 def minimise(
