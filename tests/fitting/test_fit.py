@@ -78,6 +78,7 @@ def test_film(tmp_path: Path) -> None:
     error = np.log(modulus.value / TRUE.youngs_modulus)
     assert modulus.observable and abs(error) < min(0.08, 2.0 * np.log(modulus.high / modulus.value))
     assert len(residuals.tracks) > 5 and found.details["followed"] > 0.8
+    assert found.unweighed().lines()[0].startswith("Young's modulus over density: ")
     found.write(tmp_path / "fit.json")
     told = json.loads((tmp_path / "fit.json").read_text())
     assert set(told["parameters"]["viscosity"]) == {"value", "low", "high", "observable", "unit", "reason"}
