@@ -105,10 +105,20 @@ def fit_film(
     posed = replace(space, mean=space.changed(space.mean, "start", clip.times[-1]), high=np.full(len(NAMES), np.inf))
     pose = kept("pose", lambda: minimise(residuals, posed, posed.mean, (*_POSE, "edge"), rounds=6).x)
     mask, overlap, twin = _compared(residuals, pose, mattes.cover[0])
+    outlines = {"cover": mattes.cover, "twin": twin}
+
+    def check_needed(x: Array, some: slice, what: str) -> None:
+        """Refuse parameters of which some are too far from what is expected."""
+        needed = np.abs(x - space.mean)[some] / space.prior[some]
+        if needed.max() > BEYOND:
+            what += f" {NAMES[some][int(needed.argmax())]} off by {needed.max():.0f} times its prior"
+            raise clip.refused(what, hint="check the object, --size, --up, --held and the camera", **outlines)
+
+    check_needed(pose, CAMERA, "another object or size, or another camera: before it is let go they only fit with")
     if overlap < OVERLAP:
         what = f"only {overlap:.0%} of object and picture overlap before it is let go"
         hint = "check --size, --up, the object and the camera of the scene, or give --plate"
-        raise clip.refused(what, hint=hint, cover=mattes.cover, twin=twin)
+        raise clip.refused(what, hint=hint, **outlines)
     residuals.mask(mask)
     early = every[clip.times <= release + EARLY]
     residuals.frames, residuals.moving = early, True
@@ -140,15 +150,11 @@ def fit_film(
     best = minimise(residuals, space, x, names, rounds=6, lasting=_LASTING)
     cover = best.residuals[: residuals.sizes[0]]
     followed = _followed(cover.reshape(len(every), -1), unmoved)
-    hint = "film one object that is held by one end and let go, before a background at rest"
     if followed < FOLLOWED and np.sqrt((cover**2).mean()) > LEFT:
+        hint = "film one object that is held by one end and let go, before a background at rest"
         what = f"not observable, because the twin follows {followed:.0%} of what moves"
-        raise clip.refused(what, hint=hint, cover=mattes.cover, twin=twin)
-    needed = np.abs(best.x - space.mean)[2:] / space.prior[2:]
-    if needed.max() > BEYOND:
-        name, beyond = NAMES[2 + int(needed.argmax())], needed.max()
-        what = f"not observable, because the twin needs {name} off by {beyond:.0f} times its prior"
-        raise clip.refused(what, hint=f"check camera, size and --held; {hint}", cover=mattes.cover, twin=twin)
+        raise clip.refused(what, hint=hint, **outlines)
+    check_needed(best.x, slice(2, None), "not observable, because the twin needs")
     tell("the integrator's share", 0.95)
     shift = integrator_shift(thing, material, best.x, float(clip.times[-1] - best.x[START]), device)
     x = best.x.copy()

@@ -93,7 +93,7 @@ class FilmResiduals:
     def mask(self, mask: Array) -> None:
         """Compare pixels where a mask (H, W) is 1, and near the object."""
         cv2 = open_cv()
-        self._mask, self._target = mask, blurred(self.cover * mask)[:, ::2, ::2]
+        self.region, self._target = mask, blurred(self.cover * mask)[:, ::2, ::2]
         near = cv2.dilate((self._target.max(axis=0) > 0.02).astype(np.uint8), np.ones((9, 9))) > 0
         self._pixels = near & (blurred(mask[None])[0, ::2, ::2] > 0.99)
 
@@ -125,7 +125,7 @@ class FilmResiduals:
         drawn = self.pictures.draw(q.reshape(-1, *q.shape[2:]), poses.reshape(-1, 4, 4))
         q, poses = (a.reshape(count, frames, -1, *a.shape[2:]).mean(axis=2) for a in (q, poses))
         drawn = drawn.reshape(count * frames, -1, *drawn.shape[1:]).mean(axis=1)
-        small = blurred(drawn * self._mask)[:, ::2, ::2].reshape(count, frames, *self._target.shape[1:])
+        small = blurred(drawn * self.region)[:, ::2, ::2].reshape(count, frames, *self._target.shape[1:])
         rows, columns = np.gradient(small, axis=(2, 3))
         slope = np.hypot(rows, columns)
         r = (small + sets[:, EDGE, None, None, None] * slope - self._target[self.frames])[:, :, self._pixels]
