@@ -15,12 +15,7 @@ from softmode.checks import require_number, require_numbers
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body
-from softmode.deformables.model.status import (
-    WORLD_COLLAPSED,
-    WORLD_CONTACT_OVERFLOW,
-    WORLD_NOT_FINITE,
-    status_reasons,
-)
+from softmode.deformables.model.status import WORLD_COLLAPSED, WORLD_CONTACT_OVERFLOW, WORLD_NOT_FINITE, status_reasons
 from softmode.deformables.model.tables import present
 from softmode.errors import ConfigError, FitError, SolverDiverged
 from softmode.fitting.estimates import Estimate, Fitted, floor_of

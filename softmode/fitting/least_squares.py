@@ -101,13 +101,7 @@ class Solution:
 
 
 def minimise(
-    residuals: Residuals,
-    space: Space,
-    start: Array,
-    free: Sequence[str],
-    *,
-    rounds: int,
-    lasting: Sequence[str] = (),
+    residuals: Residuals, space: Space, start: Array, free: Sequence[str], *, rounds: int, lasting: Sequence[str] = ()
 ) -> Solution:
     """Find the parameters of least residuals near a start.
 

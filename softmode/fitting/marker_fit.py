@@ -76,12 +76,7 @@ class MarkerFit:
     """
 
     def __init__(
-        self,
-        thing: SoftObject,
-        places: MarkerPlaces,
-        *,
-        material: Material,
-        device: wp.DeviceLike = None,
+        self, thing: SoftObject, places: MarkerPlaces, *, material: Material, device: wp.DeviceLike = None
     ) -> None:
         """Find the functions at the markers."""
         if not places.points:

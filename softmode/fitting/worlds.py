@@ -112,12 +112,7 @@ class HeldWorlds(FitWorlds):
             present(state.particle_f).assign(np.tile(load, (self.count, 1)).astype(np.float32))
 
     def run(
-        self,
-        parameters: Mapping[str, ArrayLike],
-        seconds: float,
-        *,
-        tilt: ArrayLike = (0.0, 0.0),
-        every: int = 2,
+        self, parameters: Mapping[str, ArrayLike], seconds: float, *, tilt: ArrayLike = (0.0, 0.0), every: int = 2
     ) -> tuple[Array, Array]:
         """Let the body go from its rest shape, without speed.
 
