@@ -14,7 +14,9 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 
+from softmode.cli.main import main
 from softmode.deformables import BuildOptions, Material
 from softmode.errors import FitError
 from softmode.fitting.film import Clip, find_mattes
@@ -23,9 +25,10 @@ from softmode.fitting.film_residuals import NAMES, FilmResiduals
 from softmode.fitting.holding import Held, held_object
 from softmode.fitting.least_squares import Space, minimise
 from softmode.objects import ObjectConfig, SoftObject, load
-from softmode.objects.object_file import stored_bars
+from softmode.objects.object_file import stored_bars, write_object
 from softmode.splats.colored_mesh import ColoredMesh
 from softmode.splats.raster.pinhole import PinholeCamera
+from softmode.viz.film import Film
 from tests.fitting.films import Trouble, make_film
 from tests.needs import needs
 
@@ -37,14 +40,19 @@ EXPOSURE = 0.8 / 30.0
 
 
 @functools.cache
-def bar(functions: int) -> SoftObject:
-    """Return a coloured bar of 20 x 5 x 4 cm with its first 3 cm held."""
+def free_bar(functions: int) -> SoftObject:
+    """Return a coloured bar of 20 x 5 x 4 cm."""
     mesh: Any = trimesh.creation.box((0.2, 0.05, 0.04)).subdivide_to_size(0.012)
     stripes = (40 + 180 * (np.sin(90 * mesh.vertices[:, :1] + [0, 2, 4]) > 0)).astype(np.uint8)
     mesh.visual.vertex_colors = np.hstack([stripes, np.full((len(stripes), 1), 255, np.uint8)])
     made = BuildOptions(function_count=functions, kernel_count=300, cubature_count=128)
     told = {"size": 0.2, "splat_count": 1200, "surface_count": 120, "pose": "captured"}
-    return held_object(load(ColoredMesh.from_trimesh(mesh), build=made, material=TRUE, **told), HELD)
+    return load(ColoredMesh.from_trimesh(mesh), build=made, material=TRUE, **told)
+
+
+def bar(functions: int) -> SoftObject:
+    """Return the bar with its first 3 cm held."""
+    return held_object(free_bar(functions), HELD)
 
 
 @functools.cache
@@ -132,6 +140,26 @@ def test_films_of_something_else(what: str, match: str) -> None:
     with pytest.raises(FitError, match=match) as caught:
         fit_film(thing, clip, camera, material=TRUE, plate=plate)
     assert caught.value.hint and caught.value.picture.shape == (80, 240, 3)
+
+
+def test_the_command_shows_what_it_refuses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A film in which nothing moves leaves no twin, but a picture of what it shows, which the message names."""
+    clip, plate, _ = film()
+    thing = free_bar(24)
+    write_object(tmp_path / "bar.npz", thing.body, thing.splats)
+    Image.fromarray(plate).save(tmp_path / "plate.png")
+    with Film(tmp_path / "still.mp4") as still:
+        for _ in range(20):
+            still.add(clip.frames[0], 30)
+        still.publish()
+    given = {"--object": "bar.npz", "--plate": "plate.png", "--out": "toy.npz"}
+    files = [word for name, file in given.items() for word in (name, str(tmp_path / file))]
+    camera = ["--held=-x:0.03", "--camera", "0", "-0.5", "0.1"]
+    assert main(["fit", str(tmp_path / "still.mp4"), *files, *camera]) == 2
+    said = capsys.readouterr().err
+    assert "nothing moves" in said and "toy.refused.png" in said and not (tmp_path / "toy.npz").exists()
+    with Image.open(tmp_path / "toy.refused.png") as picture:
+        assert picture.size == (480, 160)
 
 
 def test_bars_cover_the_truth() -> None:
