@@ -50,6 +50,7 @@ def free_bar(functions: int) -> SoftObject:
     return load(ColoredMesh.from_trimesh(mesh), build=made, material=TRUE, **told)
 
 
+@functools.cache
 def bar(functions: int) -> SoftObject:
     """Return the bar with its first 3 cm held."""
     return held_object(free_bar(functions), HELD)
