@@ -150,8 +150,9 @@ def test_the_command_shows_what_it_refuses(tmp_path: Path, capsys: pytest.Captur
     write_object(tmp_path / "bar.npz", thing.body, thing.splats)
     Image.fromarray(plate).save(tmp_path / "plate.png")
     with Film(tmp_path / "still.mp4") as still:
-        for _ in range(20):
-            still.add(clip.frames[0], 30)
+        for k in range(20):
+            noise = np.random.default_rng(k).normal(0.0, 5.0, plate.shape)
+            still.add(np.clip(clip.frames[0] + noise, 0, 255).astype(np.uint8), 30)
         still.publish()
     given = {"--object": "bar.npz", "--plate": "plate.png", "--out": "toy.npz"}
     files = [word for name, file in given.items() for word in (name, str(tmp_path / file))]
