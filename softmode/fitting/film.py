@@ -263,5 +263,6 @@ def _release(clip: Clip, cover: Array) -> int:
             "let go of one end, hold it so that it sags, or film a softer object; a stiff one needs --press and a scale"
         )
         raise clip.refused("not observable, because nothing moves by more than a pixel", hint=hint, cover=cover)
-    moved = np.flatnonzero(change > 1.3 * flicker + 0.08 * (change.max() - 1.3 * flicker))
-    return max(int(moved[0]) - 1, 0)
+    away = int(np.argmax(change > 1.3 * flicker + 0.08 * (change.max() - 1.3 * flicker)))
+    still = np.flatnonzero(change[:away] <= 1.6 * flicker + 0.25 * rim)  # of a large motion 8 % are many pixels
+    return int(still[-1]) if len(still) else 0

@@ -21,14 +21,14 @@ pytestmark = needs("cv2")
 Frames = np.ndarray
 
 
-def bar_film(swing: float = 6.0, *, count: int = 24, at: int = 20) -> tuple[Frames, Frames]:
+def bar_film(swing: float = 6.0, *, count: int = 24, at: int = 20, rate: float = 0.7) -> tuple[Frames, Frames]:
     """Return frames of a bar that swings by so many pixels from the sixth on, and the plate."""
     r = np.random.default_rng(0)
     plate = (120 + 40 * np.sin(np.arange(64) / 5.0)[:, None, None] + np.zeros((64, 64, 3))).astype(np.uint8)
     frames = []
     for k in range(count):
         image = plate.astype(float)
-        y = at + swing * (1.0 - np.cos(0.7 * max(k - 5, 0)))
+        y = at + swing * (1.0 - np.cos(rate * max(k - 5, 0)))
         rows = np.clip(np.arange(64) - y + 0.5, 0, 1) * np.clip(y + 10.5 - np.arange(64), 0, 1)
         image[:, 16:48] += rows[:, None, None] * (np.array([230, 30, 30]) - image[:, 16:48])
         frames.append(np.clip(image + r.normal(0, 3, image.shape), 0, 255).astype(np.uint8))
@@ -47,6 +47,7 @@ def test_mattes() -> None:
     assert found.cover[0].sum() == pytest.approx(32 * 11, rel=0.1)
     assert found.noise == pytest.approx(3.0, rel=0.2)
     assert 4 <= found.release <= 6
+    assert find_mattes(clip_of(bar_film(15.0, at=8, rate=0.3)[0]), plate).release == 5  # the first 0.7 px of 30 count
 
 
 @pytest.mark.parametrize(
