@@ -254,10 +254,10 @@ def outlined(frame: Image, cover: Array, twin: Array) -> Image:
 def _release(clip: Clip, cover: Array) -> int:
     """Return the last frame before anything moves; refuse a film in which nothing does."""
     soft = blurred(cover)
-    still = np.abs(np.diff(soft, axis=0)).reshape(len(soft) - 1, -1)
-    flicker = float(np.median(np.sort(still.sum(axis=1))[: max(3, len(still) // 4)]))
-    change = np.abs(soft - soft[0]).reshape(len(soft), -1).sum(axis=1)
+    steps = np.sort(np.abs(np.diff(soft, axis=0)).sum(axis=(1, 2)))
+    change = np.abs(soft - soft[0]).sum(axis=(1, 2))
     rim = np.sqrt(max(float((cover[0] > 0.5).sum()), 1.0))
+    flicker = min(float(np.median(steps[: max(3, len(steps) // 4)])), 0.4 * rim)  # more is motion in every frame
     if np.sort(change)[-5] < 1.6 * flicker + 0.1 * rim:  # of noise alone the largest is twice the smallest
         hint = (
             "let go of one end, hold it so that it sags, or film a softer object; a stiff one needs --press and a scale"
