@@ -207,7 +207,8 @@ def _told(
     modulus = Estimate.of_logarithm(x[0], bar, unit="Pa", reason=why)
     dies = deviation["viscosity"] > 0.5 or best.x[1] > space.high[1] - 0.1
     swings = "its motion dies, or is too small, before a second swing is seen" if dies else ""
-    viscosity = Estimate.of_logarithm(x[1], float(np.hypot(deviation["viscosity"], 0.1)), unit="s", reason=swings)
+    spread = float(np.linalg.norm([deviation["viscosity"], 0.1, 2.0 * floor_of(thing)]))  # thin walls: 1.6 times, once
+    viscosity = Estimate.of_logarithm(x[1], spread, unit="s", reason=swings)
     notes = [f"from {len(clip.times)} frames and {len(residuals.tracks)} tracks"]
     frequency = first_frequency(thing, float(np.exp(x[0])), material)
     if frequency > 0.5 / clip.interval:
