@@ -259,9 +259,7 @@ def _release(clip: Clip, cover: Array) -> int:
     rim = np.sqrt(max(float((cover[0] > 0.5).sum()), 1.0))
     flicker = min(float(np.median(steps[: max(3, len(steps) // 4)])), 0.4 * rim)  # more is motion in every frame
     if np.sort(change)[-5] < 1.6 * flicker + 0.1 * rim:  # of noise alone the largest is twice the smallest
-        hint = (
-            "let go of one end, hold it so that it sags, or film a softer object; a stiff one needs --press and a scale"
-        )
+        hint = "let go of one end, hold it so that it sags, or press a stiff object with a scale: --press"
         raise clip.refused("not observable, because nothing moves by more than a pixel", hint=hint, cover=cover)
     away = int(np.argmax(change > 1.3 * flicker + 0.08 * (change.max() - 1.3 * flicker)))
     still = np.flatnonzero(change[:away] <= 1.6 * flicker + 0.25 * rim)  # of a large motion 8 % are many pixels
