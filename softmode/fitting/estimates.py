@@ -7,14 +7,16 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from softmode import __version__
 from softmode.deformables.materials.material import Material
 from softmode.files import PendingFile
+from softmode.fitting.film import Clip
 from softmode.fitting.least_squares import Array, Space
+from softmode.fitting.tables import ForceLog, Markers
 from softmode.objects.object_file import write_object
 from softmode.objects.soft_object import SoftObject
 
@@ -85,13 +87,6 @@ def asked_for(
     return found
 
 
-class Recorded(Protocol):
-    """A film, markers or a force log."""
-
-    source: str
-    fingerprint: str
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Fitted:
     """What a fit found."""
@@ -111,7 +106,12 @@ class Fitted:
 
     @classmethod
     def of(
-        cls, data: Recorded, estimates: dict[str, Estimate], told: Material, notes: Sequence[str], **details: Any
+        cls,
+        data: Clip | Markers | ForceLog,
+        estimates: dict[str, Estimate],
+        told: Material,
+        notes: Sequence[str],
+        **details: Any,
     ) -> Fitted:
         """Return what was found of data; the material is what was told, with the numbers that are observable."""
         names = [name for name, one in estimates.items() if one.observable and hasattr(told, name)]

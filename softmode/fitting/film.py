@@ -57,7 +57,9 @@ class Clip:
         if not (np.diff(self.times) > 0.0).all():
             raise self.refused("its times do not increase", hint="export it again at a constant rate")
 
-    def refused(self, what: str, *, hint: str, cover: Array | None = None, twin: Array | None = None) -> FitError:
+    def refused(
+        self, what: str, *, hint: str, cover: Array | None = None, twin: NDArray[Any] | None = None
+    ) -> FitError:
         """Return the error that says what is wrong, with a picture: the first frame, the most different one, the last.
 
         Args:
@@ -241,7 +243,7 @@ def _check_alone(clip: Clip, cover: Array) -> None:
         raise clip.refused("two things move", hint="film one object, before a background at rest", cover=cover)
 
 
-def outlined(frame: Image, cover: Array, twin: Array) -> Image:
+def outlined(frame: Image, cover: Array, twin: NDArray[Any]) -> Image:
     """Return a frame with the rim of what covers it in red and that of the object in blue."""
     picture = frame.copy()
     for area, color in ((cover, (255, 0, 0)), (twin, (0, 0, 255))):

@@ -216,8 +216,7 @@ def _told(
             f"the object swings at {frequency:.3g} Hz, beyond half of the film's {1.0 / clip.interval:.3g} frames per"
             " second: film faster, or give --fps-true if it was"
         )
-    estimates = {"youngs_modulus": modulus, "viscosity": viscosity}
-    estimates |= asked_for(free, material, space, x, deviation)
+    estimates = {"youngs_modulus": modulus, "viscosity": viscosity} | asked_for(free, material, space, x, deviation)
     return Fitted.of(clip, estimates, material, notes)
 
 

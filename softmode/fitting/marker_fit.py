@@ -194,8 +194,7 @@ def fit_markers(
     """
     fit = MarkerFit(thing, places, material=material, device=device)
     best, deviation, left = fit.fit_motion(markers, [name for name in free if name in FREE])
-    x = best.x
-    moved = fit.moved(markers)
+    x, moved = best.x, fit.moved(markers)
     if left > 0.4 * float(np.sqrt((moved**2).mean())):
         what = f"{markers.source}: not observable, because the twin does not follow the markers ({1e3 * left:.2g} mm)"
         raise FitError(what, hint="check places and axes of the markers, --held, and that it is let go")
