@@ -146,11 +146,11 @@ class Fitted:
             title = name.replace("youngs_modulus", "Young's modulus").replace("_", " ")
             value = f"{scale * one.value:.3g} {unit} ({scale * one.low:.3g} to {scale * one.high:.3g})"
             found.append(f"{title}: {value}" if one.observable else f"{title}: not observable, because {one.reason}")
-        for name, one in self.estimates.items():
-            if not one.observable and hasattr(self.material, name):
-                kept = f"{name} = {getattr(self.material, name):.3g} {one.unit}"
-                found.append(f"the twin keeps {kept}, which was not found")
-        return [*found, *self.notes]
+        lost = {k: one.unit for k, one in self.estimates.items() if not one.observable and hasattr(self.material, k)}
+        kept = [
+            f"the twin keeps {k} = {getattr(self.material, k):.3g} {u}, which was not found" for k, u in lost.items()
+        ]
+        return [*found, *kept, *self.notes]
 
     def write(self, path: Path) -> None:
         """Write ``fit.json``; it appears whole or not at all."""

@@ -57,9 +57,7 @@ class Clip:
         if not (np.diff(self.times) > 0.0).all():
             raise self.refused("its times do not increase", hint="export it again at a constant rate")
 
-    def refused(
-        self, what: str, *, hint: str, cover: Array | None = None, twin: NDArray[Any] | None = None
-    ) -> FitError:
+    def refused(self, what: str, *, hint: str, cover: Array | None = None, twin: Any = None) -> FitError:
         """Return the error that says what is wrong, with a picture: the first frame, the most different one, the last.
 
         Args:
