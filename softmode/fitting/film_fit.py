@@ -260,8 +260,7 @@ def _followed(r: Array, unmoved: Array) -> float:
 
 def first_frequency(thing: SoftObject, youngs_modulus: float, material: Material) -> float:
     """Return about the lowest frequency of an object that one end holds [Hz]: that of a cantilever of its size."""
-    low, high = thing.body.bounds
-    span = np.sort(high - low)
+    span = np.sort(np.ptp(thing.body.bounds, axis=0))
     return 0.1615 * float(span[0]) / float(span[2]) ** 2 * float(np.sqrt(youngs_modulus / material.density))
 
 
