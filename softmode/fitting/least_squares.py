@@ -80,8 +80,8 @@ class Solution:
 
         Of two the larger: that of Gauss and Newton with the priors, times chi where it is above one, and the jackknife
         over blocks of residuals that may err together (MacKinnon and White 1985, doi:10.1016/0304-4076(85)90158-7): a
-        plain sandwich is too small where a few blocks, such as the first swing, tell most. Where the search ended
-        before the least cost, the step that is left to it counts as an error too.
+        plain sandwich is too small where a few blocks, such as the first swing, tell most. Where the search ran
+        out of rounds, the step that is left to the least cost counts as an error too.
 
         Args:
             blocks: Indices of residuals.
@@ -96,7 +96,7 @@ class Solution:
         scores = np.array([np.linalg.solve(a, J[b].T @ (w * r)[b]) for a, b in zip(without, blocks, strict=True)])
         sandwich = inverse @ (scores.T @ scores + np.diag(1.0 / self.prior**2)) @ inverse
         away = (self.x - self.space.mean)[self.free] / self.prior**2
-        left = inverse @ (J.T @ (w * r) + away)
+        left = (not self.converged) * (inverse @ (J.T @ (w * r) + away))
         return np.hypot(np.sqrt(np.maximum(np.diag(inverse) * max(chi, 1.0), np.diag(sandwich))), left)
 
 
