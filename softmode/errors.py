@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
+from typing import Any
 
 
 class SoftmodeError(Exception):
@@ -55,6 +56,9 @@ class GraspError(SoftmodeError, ValueError):
 
 class FitError(SoftmodeError, ValueError):
     """A film, markers or a force log do not show what an object is made of."""
+
+    picture: Any = None
+    """Of a film: what it shows, an image (H, W, 3) of bytes."""
 
 
 class LanesError(SoftmodeError, TypeError):

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from softmode.cli.common import bar_interval, own_group, quiet_warp, short_name, warp_device
 from softmode.cli.object_options import ObjectOptions
-from softmode.errors import ConfigError
-from softmode.files import check_place
+from softmode.errors import ConfigError, FitError
+from softmode.files import PendingFile, check_place
 
 if TYPE_CHECKING:
     from softmode.cli.fit_scene import FitScene
@@ -23,6 +23,18 @@ def _refuse(options: object, names: Sequence[str], what: str) -> None:
     for name in names:
         if getattr(options, name) is not None:
             raise ConfigError(f"--{name.replace('_', '-')} says nothing about {what}", hint="leave it out")
+
+
+def _shown(error: FitError, path: Path) -> FitError:
+    """Return an error that names the picture of what was refused, which is written, if it has one."""
+    if error.picture is None:
+        return error
+    from PIL import Image
+
+    picture = Image.fromarray(error.picture)
+    with PendingFile(path, "picture") as file:
+        picture.resize((2 * picture.width, 2 * picture.height)).save(file.temporary, "PNG")
+    return FitError(f"{error.message} (see {path})", hint=error.hint)
 
 
 def _argument() -> object:
@@ -56,12 +68,16 @@ class Fit:
     """Picture of the background without the object; the median of the film if omitted."""
     fps_true: float | None = None
     """Frames per second at which a film was taken that plays slower."""
+    exposure: float | None = None
+    """For how long a frame of a film sees [s]; 0 if omitted."""
+    free: tuple[Literal["poissons_ratio", "mass_damping", "density", "friction"], ...] = ()
+    """What is fitted besides, of a film or markers; what they do not say is told."""
     scene: Path | None = None
-    """JSON file: kind, held, fps, mass, density, poissons_ratio, camera, markers, axes, load."""
+    """JSON file: kind, held, fps, exposure, free, mass, density, poissons_ratio, camera, markers, axes, load."""
     press: tuple[float, float, float] | None = None
     """Of a force log: where a ball presses the object on a table, in the axes of its file [m]."""
-    radius: float = 0.006
-    """Radius of the ball [m]."""
+    radius: float | None = None
+    """Radius of the ball [m]; 0.006 if omitted."""
     between: Literal["x", "y", "z"] | None = None
     """Of a force log: the axis along which two jaws close on the object."""
     out: Annotated[Path | None, short_name("-o")] = None
@@ -97,9 +113,14 @@ class Fit:
             density=self.toy.density,
             poissons_ratio=self.poissons_ratio,
             fps=self.fps_true,
+            exposure=self.exposure,
+            free=self.free or None,
         )
         with quiet_warp():
-            found, free, film = self._fitted(scene)
+            try:
+                found, free, film = self._fitted(scene)
+            except FitError as error:
+                raise _shown(error, out.with_suffix(".refused.png")) from error
             found.write(out.with_name("fit.json"))
             for line in found.lines():
                 print(line)
@@ -125,15 +146,22 @@ class Fit:
         device = warp_device(self.device)
         table = self.file.suffix.lower() == ".csv"
         forces = table and holds_forces(self.file)
-        film = ("camera", "fov", "plate", "fps_true")
-        if forces:
-            _refuse(self, ("held", *film), "a force log")
-        elif table:
-            _refuse(self, ("press", "between", *film), "markers")
-        else:
-            _refuse(self, ("press", "between"), "a film")
-            if self.camera is None:
-                _refuse(self, ("fov",), "a film without --camera")
+        film, pressed = ("camera", "fov", "plate", "fps_true", "exposure"), ("press", "radius", "between")
+        what, silent = (
+            ("a force log", ("held", *film))
+            if forces
+            else ("markers", (*pressed, *film))
+            if table
+            else ("a film", pressed)
+        )
+        _refuse(self, silent, what)
+        if self.camera is None:
+            _refuse(self, ("fov",), "a film without --camera")
+        if self.press is None:
+            _refuse(self, ("radius",), "jaws")
+        if forces and scene.free:
+            raise ConfigError("free says nothing about a force log", hint="leave it out: forces show one number, E")
+        scene.check_kind(what, "between" if forces and self.between else "press" if forces else "held")
         base = ObjectConfig(surface_count=3000) if forces else ObjectConfig()
         config = self.toy.object_of(base)
         told = config.material if config.body is None else load(config).material
@@ -145,7 +173,8 @@ class Fit:
         material = dataclasses.replace(made, density=density)
         if forces:
             between = None if self.between is None else "xyz".index(self.between)
-            press = Press(point=self.press, radius=self.radius, between=between)
+            ball = {} if self.radius is None else {"radius": self.radius}
+            press = Press(point=self.press, between=between, **ball)
             found = fit_force(free, read_forces(self.file), press, material=material, device=device)
             note = f"the twin has {density:g} kg/m^3, which was not measured: give --mass"
             return found if known else dataclasses.replace(found, notes=(*found.notes, note)), free, None
@@ -156,7 +185,7 @@ class Fit:
         thing = held_object(captured, held)
         if table:
             markers, places = read_markers(self.file), scene.places()
-            found = fit_markers(thing, markers, places, material=material, device=device)
+            found = fit_markers(thing, markers, places, material=material, free=scene.free, device=device)
             return found if known else found.unweighed(), free, None
         clip = Clip.read(self.file, fps_true=scene.fps)
         height, width = clip.frames.shape[1:3]
@@ -177,9 +206,10 @@ class Fit:
                 thing,
                 clip,
                 camera,
-                held,
                 material=material,
                 plate=None if self.plate is None else clip.like(self.plate),
+                exposure=scene.exposure,
+                free=scene.free,
                 keep=self.twin.with_suffix(".fit.part.json"),
                 device=device,
                 progress=tell,

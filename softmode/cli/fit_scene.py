@@ -13,7 +13,9 @@ import numpy as np
 from softmode.checks import require_number, require_numbers
 from softmode.errors import ConfigError, MaterialError
 from softmode.files import read_json
+from softmode.fitting.estimates import UNSEEN
 from softmode.fitting.marker_fit import MarkerPlaces
+from softmode.fitting.worlds import FREE
 from softmode.splats.raster.pinhole import PinholeCamera
 
 KINDS = ("held", "press", "between")
@@ -24,12 +26,16 @@ KINDS = ("held", "press", "between")
 class FitScene:
     """How an object is held, filmed and weighed; lengths in the axes of its file as `splat show` draws them."""
 
-    kind: str = "held"
-    """ "held": held by one end and let go; "press", "between": see `Press`."""
+    kind: str | None = None
+    """ "held": held by one end and let go; "press", "between": see `Press`; None for what the file and options say."""
     held: str | None = None
     """Its end, as `Held.parse` takes it."""
     fps: float | None = None
     """Frames per second at which a film was taken that plays at another rate."""
+    exposure: float = 0.0
+    """For how long a frame sees [s]."""
+    free: Sequence[str] = ()
+    """What is fitted besides."""
     mass: float | None = None
     """[kg]."""
     density: float | None = None
@@ -48,13 +54,20 @@ class FitScene:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        if self.kind not in KINDS:
+        if self.kind is not None and self.kind not in KINDS:
             hint = f"hold it by one end and let it go, or press it with a scale: kind is one of {', '.join(KINDS)}"
             raise ConfigError(f"kind is {self.kind!r}: what is thrown, dropped or poked shows no E for sure", hint=hint)
-        kinds = {"held": str | None, "camera": dict, "markers": dict, "load": dict, "axes": list | tuple}
+        kinds = {
+            "held": str | None,
+            "camera": dict,
+            "markers": dict,
+            "load": dict,
+            "axes": list | tuple,
+            "free": list | tuple,
+        }
         for name, kind in kinds.items():
             if not isinstance(value := getattr(self, name), kind):
-                hint = "give held as text, camera, markers and load as objects, axes as a list"
+                hint = "give held as text, camera, markers and load as objects, axes and free as lists"
                 raise ConfigError(f"scene: {name} is {value!r}", hint=hint)
         for name, example in (("mass", "0.142, in kg"), ("density", "300, in kg/m^3")):
             if (value := getattr(self, name)) is not None:
@@ -63,6 +76,9 @@ class FitScene:
             raise ConfigError("mass and density are given", hint="give one of them")
         if self.poissons_ratio is not None:
             require_number("poissons_ratio", self.poissons_ratio, above=-1.0, below=0.5, error=MaterialError)
+        if odd := [name for name in self.free if name not in (*FREE, *UNSEEN)]:
+            raise ConfigError(f"free: {odd} is not known", hint=f"use {', '.join((*FREE, *UNSEEN))}")
+        require_number("exposure", self.exposure, at_least=0.0, at_most=1.0, hint="give it in seconds, like 0.01")
         if self.fps is not None:
             require_number("fps", self.fps, above=0.0, at_most=1.0e5, hint="give frames per second, like 240")
 
@@ -83,6 +99,12 @@ class FitScene:
         if "mass" in given or "density" in given:
             told = {name: value for name, value in told.items() if name not in ("mass", "density")}
         return cls(**{**told, **given})
+
+    def check_kind(self, what: str, kind: str) -> None:
+        """Refuse a scene of another kind than that of what is fitted."""
+        if self.kind not in (None, kind):
+            hint = "leave it out, or give the file and the options of that kind"
+            raise ConfigError(f"kind is {self.kind!r}, and what is given is {what}: {kind}", hint=hint)
 
     def density_of(self, volume: float, otherwise: float) -> tuple[float, bool]:
         """Return the density [kg/m^3] of an object of a volume [m^3], else another one, and whether it was told."""

@@ -17,6 +17,8 @@ from softmode.envs import task_kernels as kernels
 from softmode.errors import ConfigError
 from softmode.scenes.occupancy import Occupancy
 
+Bounds = tuple[float, float]
+
 
 @dataclass(frozen=True, kw_only=True)
 class Parameter:
@@ -56,7 +58,7 @@ class ParameterTable:
     Args:
         parameters: What is drawn; a later parameter replaces an earlier one of the same name.
         occupancy: What the worlds hold.
-        kept: For each of its choices the numbers that are not drawn, by the name of a parameter.
+        kept: For each of its choices ranges of its own, least and largest, by the name of a parameter.
 
     Attributes:
         values: The drawn numbers, float32, shape (world_count, columns).
@@ -68,7 +70,7 @@ class ParameterTable:
     """
 
     def __init__(
-        self, parameters: Sequence[Parameter], occupancy: Occupancy, kept: Sequence[Mapping[str, float]] = ({},)
+        self, parameters: Sequence[Parameter], occupancy: Occupancy, kept: Sequence[Mapping[str, Bounds]] = ({},)
     ) -> None:
         """Lay out the columns and upload their ranges."""
         self.parameters = {parameter.name: parameter for parameter in parameters}
@@ -78,8 +80,9 @@ class ParameterTable:
         given = self.parameters.values()
 
         def upload(bound: str) -> wp.array:
+            end = ("low", "high").index(bound)
             rows = [
-                [np.array((own[p.name],) if p.name in own else getattr(p, bound), np.float32) for p in given]
+                [np.array((own[p.name][end],) if p.name in own else getattr(p, bound), np.float32) for p in given]
                 for own in kept
             ]
             return wp.array(np.stack([np.concatenate(row) for row in rows]), dtype=float, device=device)
@@ -145,7 +148,8 @@ class Materials:
         solver: What they are set in.
         table: The parameters.
         stride: Soft bodies of a world.
-        kept: For each choice of the occupancy the properties that are not drawn.
+        kept: For each choice of the occupancy ranges of its own; several objects of a world have their middle, all but
+            the first.
 
     Attributes:
         values: Each property by its name, shape (world_count * stride,).
@@ -154,7 +158,7 @@ class Materials:
     NAMES = ("youngs_modulus", "poissons_ratio", "density", "friction", "scale")
 
     def __init__(
-        self, solver: Any, table: ParameterTable, stride: int, kept: Sequence[Mapping[str, float]] = ({},)
+        self, solver: Any, table: ParameterTable, stride: int, kept: Sequence[Mapping[str, Bounds]] = ({},)
     ) -> None:
         """Allocate the properties."""
         worlds, device = table.world_count, table.values.device
@@ -162,7 +166,8 @@ class Materials:
         self._all = wp.zeros((len(self.NAMES), worlds * stride), dtype=float, device=device)
         self.values: dict[str, wp.array] = {name: cast(wp.array, self._all[k]) for k, name in enumerate(self.NAMES)}
         self._columns = wp.array([table.column(name) for name in self.NAMES], dtype=int, device=device)
-        own = [[each.get(name, math.nan) for name in self.NAMES] for each in kept]
+        ranges = [[each.get(name, (math.nan, math.nan)) for name in self.NAMES] for each in kept]
+        own = [[low if low == high else math.sqrt(low * high) for low, high in row] for row in ranges]
         self._own = wp.array(own, dtype=float, device=device)
         self._mask = wp.zeros(worlds + 1, dtype=wp.bool, device=device)
 

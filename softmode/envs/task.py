@@ -38,7 +38,9 @@ from softmode.envs.placement import Arcs, Placement, clutter_parameters
 from softmode.envs.reward_kernels import EndReason, StepResult, WorldState
 from softmode.envs.task_config import ObservationType, TaskConfig
 from softmode.errors import ConfigError, GraspError
+from softmode.objects.object_file import stored_bars
 from softmode.objects.rest_grasps import rest_grasps
+from softmode.objects.soft_object import SoftObject
 from softmode.robots.jaws import ParallelJaw
 from softmode.scenes.capture import capture_graph
 from softmode.scenes.occupancy import Occupancy
@@ -163,7 +165,7 @@ class Task:
             self.device, held = scene.device, scene.occupancy
             if config.object_set is not None and self.grasps:
                 _check_grasps(held, ParallelJaw.of(config.scene.arm))
-            kept = [_kept(config, material) for material in held.materials]
+            kept = [_kept(config, *one) for one in zip(held.choices, held.materials, strict=True)]
             self.table = ParameterTable(self.parameters(), held, kept)
             self.materials = Materials(scene.solver, self.table, len(scene.objects), kept)
             points = [sample_farthest(thing.body.surface.points, self.point_count, first=0) for thing in held.choices]
@@ -534,7 +536,12 @@ def _check_grasps(held: Occupancy, jaw: ParallelJaw) -> None:
             raise GraspError(f"{name} does not fit the gripper: {error.message}", hint=hint) from error
 
 
-def _kept(config: TaskConfig, material: Material) -> dict[str, float]:
-    """Return the properties of a material that are not drawn."""
+def _kept(config: TaskConfig, thing: SoftObject, material: Material) -> dict[str, tuple[float, float]]:
+    """Return the ranges of the properties of an object of a set that have none: as it is, or as a fit says, E."""
     names = [name for name in Materials.NAMES if name != "scale"] if config.object_set is not None else []
-    return {name: getattr(material, name) for name in names if getattr(config, f"{name}_range") is None}
+    own = {name: getattr(material, name) for name in names if getattr(config, f"{name}_range") is None}
+    ranges = {name: (value, value) for name, value in own.items()}
+    low, value, high = stored_bars(thing.body).get("youngs_modulus", (0.0, 0.0, 0.0))
+    if own.get("youngs_modulus") == value:  # another one is that of `ObjectSet.materials`
+        ranges["youngs_modulus"] = (low, high)
+    return ranges

@@ -57,7 +57,7 @@ class TaskConfig:
     """"dense": the sum of the reward's terms; "sparse": 1 where the task counts as solved, 0 elsewhere."""
     objects: ObjectSet | None = None
     """Objects of which every world gets one, or several, in place of `scene.object`; material properties without a
-    range are those of the object, the range of another property holds for all."""
+    range are those of the object, E of a fitted one within its bars; the range of another property holds for all."""
     others_clearance: float = 0.03
     """With several objects per world (`ObjectSet.per_world`): room around each where they are put down [m]."""
     objects_one_hot: bool = False

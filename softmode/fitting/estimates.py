@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,9 @@ import numpy as np
 from softmode import __version__
 from softmode.deformables.materials.material import Material
 from softmode.files import PendingFile
+from softmode.fitting.film import Clip
+from softmode.fitting.least_squares import Array, Space
+from softmode.fitting.tables import ForceLog, Markers
 from softmode.objects.object_file import write_object
 from softmode.objects.soft_object import SoftObject
 
@@ -22,6 +26,11 @@ THIN = (0.05, 0.12)
 """Mean thickness over size, and what it adds to it: a mug was off by 17 %, its walls filled too thick."""
 CERTAIN = 0.35
 """Standard deviation of a logarithm above which a parameter is not observable."""
+UNSEEN = {
+    "density": "a motion shows E over density and nothing else: weigh the object",
+    "friction": "nothing slides on an object that is held",
+}
+"""Numbers of a material that no fit finds, and why."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,6 +59,34 @@ class Estimate:
         return cls(value=math.exp(mean), low=low, high=high, observable=known, unit=unit, reason=told)
 
 
+def asked_for(
+    free: Sequence[str], material: Material, space: Space, x: Array, deviations: Mapping[str, float]
+) -> dict[str, Estimate]:
+    """Return the estimates of numbers that a fit was asked for; those of `UNSEEN` are what was told.
+
+    Args:
+        free: Their names.
+        material: What was told.
+        space: The parameters of the fit.
+        x: Their values.
+        deviations: The standard deviations of those that were free.
+    """
+    found = {}
+    for name in free:
+        unit, reason = {"mass_damping": "1/s", "density": "kg/m^3"}.get(name, ""), UNSEEN.get(name, "")
+        value, deviation = float(getattr(material, name)), 0.0
+        if not reason:
+            at = space.names.index(name)
+            value, deviation = float(x[at]), deviations[name]
+            if deviation > 0.5 * space.prior[at]:
+                reason = (
+                    f"the data look the same from {value - deviation:.2g} to {value + deviation:.2g} {unit}".rstrip()
+                )
+        bars = {"low": value - deviation, "high": value + deviation}
+        found[name] = Estimate(value=value, **bars, observable=not reason, unit=unit, reason=reason)
+    return found
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Fitted:
     """What a fit found."""
@@ -66,6 +103,21 @@ class Fitted:
     """What the user should know."""
     details: dict[str, Any] = field(default_factory=dict)
     """Camera, start, residual of each frame, costs: as JSON holds them."""
+
+    @classmethod
+    def of(
+        cls,
+        data: Clip | Markers | ForceLog,
+        estimates: dict[str, Estimate],
+        told: Material,
+        notes: Sequence[str],
+        **details: Any,
+    ) -> Fitted:
+        """Return what was found of data; the material is what was told, with the numbers that are observable."""
+        names = [name for name, one in estimates.items() if one.observable and hasattr(told, name)]
+        found = {"material": replace(told, **{name: estimates[name].value for name in names}), "notes": tuple(notes)}
+        about = {"source": data.source, "fingerprint": data.fingerprint}
+        return cls(estimates=estimates, details=details, **about, **found)
 
     def __getitem__(self, name: str) -> Estimate:
         """Return an estimate."""
@@ -94,12 +146,11 @@ class Fitted:
             title = name.replace("youngs_modulus", "Young's modulus").replace("_", " ")
             value = f"{scale * one.value:.3g} {unit} ({scale * one.low:.3g} to {scale * one.high:.3g})"
             found.append(f"{title}: {value}" if one.observable else f"{title}: not observable, because {one.reason}")
-        for name, one in self.estimates.items():
-            if not one.observable and hasattr(self.material, name):
-                found.append(
-                    f"the twin keeps {name} = {getattr(self.material, name):.3g} {one.unit}, which was not found"
-                )
-        return [*found, *self.notes]
+        lost = {k: one.unit for k, one in self.estimates.items() if not one.observable and hasattr(self.material, k)}
+        kept = [
+            f"the twin keeps {k} = {getattr(self.material, k):.3g} {u}, which was not found" for k, u in lost.items()
+        ]
+        return [*found, *kept, *self.notes]
 
     def write(self, path: Path) -> None:
         """Write ``fit.json``; it appears whole or not at all."""
@@ -113,15 +164,11 @@ class Fitted:
             path: The .npz to write.
             thing: The object, free; what was found and from which film goes into its body's provenance.
         """
-        names = ("youngs_modulus", "poissons_ratio", "density", "viscosity", "friction")
+        names = ("youngs_modulus", "poissons_ratio", "density", "viscosity", "mass_damping", "friction")
         numbers = {name: getattr(self.material, name) for name in names}
-        bars = {name: [e.low, e.high] for name, e in self.estimates.items() if e.observable}
-        told = {
-            "material": json.dumps(numbers),
-            "fit_source": self.source,
-            "fit_fingerprint": self.fingerprint,
-            "fit_bars": json.dumps(bars),
-        }
+        bars = {name: [one.low, one.value, one.high] for name, one in self.estimates.items() if one.observable}
+        fit = {"source": self.source, "fingerprint": self.fingerprint, "parameters": bars}
+        told = {"material": json.dumps(numbers), "fit": json.dumps(fit)}
         body = replace(thing.body, provenance={**thing.body.provenance, **told})
         write_object(path, body, thing.splats, thing.radiance)
         return replace(thing, body=body, material=self.material)

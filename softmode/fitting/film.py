@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from softmode.checks import require_number
 from softmode.errors import AssetError, FitError, needs_extra
+from softmode.files import damage_errors
 from softmode.objects.fingerprint import file_fingerprint
 
 Array = NDArray[np.float64]
@@ -41,7 +42,7 @@ class Clip:
     """RGB, shape (F, H, W, 3)."""
     times: Array
     """Of the frames, from the first [s], shape (F,)."""
-    name: str = "film"
+    source: str = "film"
     """What messages call it."""
     fingerprint: str = ""
     """sha256 of its file."""
@@ -51,10 +52,28 @@ class Clip:
     def __post_init__(self) -> None:
         """Refuse what is no film."""
         if len(self.frames) < LEAST_FRAMES or not self.times[-1] > 0.2:
-            what = f"film {self.name}: {len(self.frames)} frames of {self.times[-1] if len(self.times) else 0.0:.2f} s"
-            raise FitError(what, hint="film a second or more from before the object is let go")
+            what = f"{len(self.frames)} frames of {self.times[-1] if len(self.times) else 0.0:.2f} s"
+            raise self.refused(what, hint="film a second or more from before the object is let go")
         if not (np.diff(self.times) > 0.0).all():
-            raise FitError(f"film {self.name}: its times do not increase", hint="export it again at a constant rate")
+            raise self.refused("its times do not increase", hint="export it again at a constant rate")
+
+    def refused(self, what: str, *, hint: str, cover: Array | None = None, twin: Any = None) -> FitError:
+        """Return the error that says what is wrong, with a picture: the first frame, the most different one, the last.
+
+        Args:
+            what: What is wrong.
+            hint: The remedy.
+            cover: What covers the background, 0..1, shape (F, H, W); drawn red.
+            twin: Where the object should be, 0..1, shape (H, W); drawn blue.
+        """
+        error = FitError(f"film {self.source}: {what}", hint=hint)
+        if len(self.frames):
+            off = np.abs(self.frames.astype(np.float32) - self.frames[0]).mean(axis=(1, 2, 3))
+            none = np.zeros(self.frames.shape[:3])
+            red, blue = none if cover is None else cover, none[0] if twin is None else twin
+            shown = [outlined(self.frames[k], red[k], blue) for k in (0, int(off.argmax()), -1)]
+            error.picture = np.concatenate(shown, axis=1)
+        return error
 
     @property
     def interval(self) -> float:
@@ -105,13 +124,8 @@ class Clip:
         if fps_true is not None:
             require_number("fps_true", fps_true, above=0.0, at_most=1.0e5, hint="give frames per second, like 240")
             times = times / (np.median(np.diff(times)) if len(times) > 1 else 1.0) / fps_true
-        return cls(
-            frames=np.array(frames),
-            times=times,
-            name=str(path),
-            fingerprint=file_fingerprint(path),
-            shrink=shrink,
-        )
+        told = {"source": str(path), "fingerprint": file_fingerprint(path)}
+        return cls(frames=np.array(frames), times=times, shrink=shrink, **told)
 
 
 def _video(path: Path) -> Any:
@@ -132,7 +146,7 @@ def _gif(path: Path) -> Any:
     from PIL import ImageSequence
 
     time = 0.0
-    with Picture.open(path) as file:
+    with damage_errors(f"film {path}", hint="export it again"), Picture.open(path) as file:
         for frame in ImageSequence.Iterator(file):
             yield time, np.asarray(frame.convert("RGB"))
             time += 1.0e-3 * max(float(frame.info.get("duration", 100.0)), 10.0)
@@ -167,21 +181,20 @@ def find_mattes(clip: Clip, plate: Image | None) -> Mattes:
     noise = max(float(1.4826 / np.sqrt(2.0) * np.median(np.abs(steps[steps != 0.0]))) if steps.any() else 0.0, 1.0)
     back = np.median(smooth, axis=0) if plate is None else plate.astype(np.float32)
     if back.shape != smooth.shape[1:]:
-        raise FitError(
-            f"plate has shape {back.shape}, the film {smooth.shape[1:]}", hint="take it with the same camera"
-        )
+        raise clip.refused(f"its plate has shape {back.shape[:2]}", hint="take it with the same camera")
     _check_background(clip, smooth, noise)
     level = np.clip((smooth * back).sum(axis=3) / ((back * back).sum(axis=2) + 1e-6), 0.98, 1.02)
     away = np.sqrt(((smooth - level[..., None] * back) ** 2).mean(axis=3))
     cover = np.array([_solid(np.clip((a - 3.0 * noise) / (7.0 * noise), 0.0, 1.0)) for a in away])
     if (cover > 0.5).mean(axis=(1, 2)).max() < 0.002 or (cover > 0.5).mean() > 0.7:
         hint = "film it before another background, or give the picture without it: --plate empty.png"
-        raise FitError(f"film {clip.name}: the object cannot be told from the background", hint=hint)
+        raise clip.refused("the object cannot be told from the background", hint=hint, cover=cover)
     release = _release(clip, cover)
     edge = np.ones(cover.shape[1:], bool)
     edge[2:-2, 2:-2] = False
     if (cover[release:, edge] > 0.5).sum(axis=1).max() > (cover[0, edge] > 0.5).sum() + 6:
-        raise FitError(f"film {clip.name}: the object leaves the picture", hint="film it from farther away")
+        raise clip.refused("the object leaves the picture", hint="film it from farther away", cover=cover)
+    _check_alone(clip, cover)
     return Mattes(cover=cover, noise=noise, release=release)
 
 
@@ -207,23 +220,47 @@ def _check_background(clip: Clip, smooth: Array, noise: float) -> None:
     limit = 2.0 * float(np.quantile(steps, 0.25)) + 0.5 * noise
     cuts = np.flatnonzero(steps > limit)
     if 0 < len(cuts) <= 2:
-        what = f"film {clip.name}: is cut at {clip.times[cuts[0] + 1]:.2f} s"
-        raise FitError(what, hint="give one take, from before it is let go")
+        what = f"is cut at {clip.times[cuts[0] + 1]:.2f} s"
+        raise clip.refused(what, hint="give one take, from before it is let go")
     if len(cuts) or np.median(np.abs(smooth[-1] - smooth[0])) > limit:
-        raise FitError(f"film {clip.name}: the camera or the light moves", hint="put the camera on a tripod")
+        raise clip.refused("the camera or the light moves", hint="put the camera on a tripod")
+
+
+def _check_alone(clip: Clip, cover: Array) -> None:
+    """Refuse a film in which two things move that lie apart while nothing does; one that rests is no object."""
+    cv2 = open_cv()
+    near = cv2.dilate((cover[0] > 0.5).astype(np.uint8), np.ones((9, 9)))
+    count, label = cv2.connectedComponents(near)
+    soft, moved = blurred(cover), []
+    for k in range(1, count):
+        zone = cv2.dilate((label == k).astype(np.uint8), np.ones((5, 5))) > 0
+        area = float(cover[0, label == k].sum())
+        change = np.abs(soft[:, zone] - soft[0, zone]).sum(axis=1).max()
+        moved.append((change > 0.15 * area) * area)
+    if len(moved) > 1 and sorted(moved)[-2] > 0.1 * max(moved):
+        raise clip.refused("two things move", hint="film one object, before a background at rest", cover=cover)
+
+
+def outlined(frame: Image, cover: Array, twin: NDArray[Any]) -> Image:
+    """Return a frame with the rim of what covers it in red and that of the object in blue."""
+    picture = frame.copy()
+    for area, color in ((cover, (255, 0, 0)), (twin, (0, 0, 255))):
+        inner = np.pad(area > 0.5, 1)
+        rim = inner[2:, 1:-1] | inner[:-2, 1:-1] | inner[1:-1, 2:] | inner[1:-1, :-2]
+        picture[rim & ~inner[1:-1, 1:-1]] = color
+    return picture
 
 
 def _release(clip: Clip, cover: Array) -> int:
     """Return the last frame before anything moves; refuse a film in which nothing does."""
     soft = blurred(cover)
-    still = np.abs(np.diff(soft, axis=0)).reshape(len(soft) - 1, -1)
-    flicker = float(np.median(np.sort(still.sum(axis=1))[: max(3, len(still) // 4)]))
-    change = np.abs(soft - soft[0]).reshape(len(soft), -1).sum(axis=1)
+    steps = np.sort(np.abs(np.diff(soft, axis=0)).sum(axis=(1, 2)))
+    change = np.abs(soft - soft[0]).sum(axis=(1, 2))
     rim = np.sqrt(max(float((cover[0] > 0.5).sum()), 1.0))
-    if change.max() < 1.3 * flicker + 0.1 * rim:
-        hint = (
-            "let go of one end, hold it so that it sags, or film a softer object; a stiff one needs --press and a scale"
-        )
-        raise FitError(f"film {clip.name}: not observable, because nothing moves by more than a pixel", hint=hint)
-    moved = np.flatnonzero(change > 1.3 * flicker + 0.08 * (change.max() - 1.3 * flicker))
-    return max(int(moved[0]) - 1, 0)
+    flicker = min(float(np.median(steps[: max(3, len(steps) // 4)])), 0.4 * rim)  # more is motion in every frame
+    if np.sort(change)[-5] < 1.6 * flicker + 0.1 * rim:  # of noise alone the largest is twice the smallest
+        hint = "let go of one end, hold it so that it sags, or press a stiff object with a scale: --press"
+        raise clip.refused("not observable, because nothing moves by more than a pixel", hint=hint, cover=cover)
+    away = int(np.argmax(change > 1.3 * flicker + 0.08 * (change.max() - 1.3 * flicker)))
+    still = np.flatnonzero(change[:away] <= 1.6 * flicker + 0.25 * rim)  # of a large motion 8 % are many pixels
+    return int(still[-1]) if len(still) else 0

@@ -7,22 +7,21 @@ import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
 from softmode.deformables.materials.material import Material
-from softmode.errors import FitError
-from softmode.fitting.estimates import Estimate, Fitted, floor_of
+from softmode.fitting.estimates import Estimate, Fitted, asked_for, floor_of
 from softmode.fitting.film import Clip, Image, blurred, find_mattes, open_cv
-from softmode.fitting.film_residuals import CAMERA, HOLDER, NAMES, FilmResiduals, film_space
-from softmode.fitting.holding import Held
+from softmode.fitting.film_residuals import CAMERA, HOLDER, NAMES, START, STEP, FilmResiduals, film_space
 from softmode.fitting.kept import KeptStages
 from softmode.fitting.least_squares import Solution, Space, cost_of, minimise
 from softmode.fitting.pictures import project
 from softmode.fitting.tracks import follow
-from softmode.fitting.worlds import FitWorlds
+from softmode.fitting.worlds import FREE, PHYSICS, HeldWorlds
 from softmode.objects.soft_object import SoftObject
 from softmode.splats.raster.pinhole import PinholeCamera
 
@@ -34,8 +33,8 @@ EARLY = 0.4
 """How much of the motion the starts are compared by [s]: later a stiffness is mistaken for one of another swing."""
 BEYOND = 5.0
 """How many of its priors a parameter may need."""
-OVERLAP = 0.7
-"""Least overlap of object and matte before anything moves, intersection over union."""
+OVERLAP = 0.85
+"""Least overlap of object and matte before anything moves, intersection over union: at 0.79 E was 41 % too large."""
 FOLLOWED = 0.8
 """Least share of the motion's cost that the twin has to explain, where more than `LEFT` is left."""
 LEFT = 0.2
@@ -48,10 +47,11 @@ def fit_film(
     thing: SoftObject,
     clip: Clip,
     camera: PinholeCamera,
-    held: Held,
     *,
     material: Material,
     plate: Image | None = None,
+    exposure: float = 0.0,
+    free: Sequence[str] = (),
     keep: Path | None = None,
     device: wp.DeviceLike = None,
     progress: Progress | None = None,
@@ -62,10 +62,11 @@ def fit_film(
         thing: The object with its end held, see `held_object`.
         clip: The film.
         camera: About where the camera is, in the axes of the object's file, for frames of the film's size.
-        held: What is held.
         material: Density and Poisson's ratio; the rest is where the fit begins. `Fitted.unweighed` tells what is known
             where the density is not measured.
         plate: The picture without the object, of the film's size.
+        exposure: For how long a frame sees [s].
+        free: What is fitted besides, of `worlds.FREE` and `estimates.UNSEEN`.
         keep: File that keeps the stages that are done until all are; a fit that was cut off goes on with them.
         device: Warp device.
         progress: Told each stage and how far it is, 0..1.
@@ -74,7 +75,8 @@ def fit_film(
         What was found; what it was fitted with; and all parameters, as `film_residuals.NAMES` has them.
 
     Raises:
-        FitError: If the film does not show it: nothing moves, the object is another one, the motion is not followed.
+        FitError: If the film does not show it: nothing moves, the object is another one, the motion is not followed;
+            it has a picture of the film.
     """
     done: tuple[str, float] = ("", 0.0)
 
@@ -85,31 +87,44 @@ def fit_film(
             progress(stage, fraction)
 
     pixels = hashlib.sha256(clip.frames.tobytes() + clip.times.tobytes() + (b"" if plate is None else plate.tobytes()))
-    kept = KeptStages(keep, pixels.hexdigest(), thing.body.fingerprint, camera, held, material)
+    kept = KeptStages(keep, pixels.hexdigest(), thing.body.fingerprint, camera, material, exposure, free)
     tell("looking at the film", 0.0)
     mattes = find_mattes(clip, plate)
     tracks = follow(clip, mattes.cover)
     placed = replace(camera, position=tuple(np.subtract(camera.position, thing.body.offset).tolist()))
-    residuals = FilmResiduals(thing, material, clip, mattes, placed, device=device)
+    names = [name for name in NAMES if name not in FREE or name in free]
+    more = len(names) - len(NAMES) + len(FREE)
+    residuals = FilmResiduals(thing, material, clip, mattes, placed, exposure=exposure, free=more, device=device)
     residuals.after = lambda: tell(done[0], min(done[1] + 0.01, 0.99))
     every, release = residuals.frames, float(clip.times[mattes.release])
-    space = film_space(release - 0.25 * clip.interval, clip.interval, material.density)
+    space = film_space(release - 0.25 * clip.interval, clip.interval, material)
 
     tell("finding the camera", 0.05)
     still = np.unique(np.linspace(0, mattes.release, 3).astype(int))
     residuals.frames = still
     posed = replace(space, mean=space.changed(space.mean, "start", clip.times[-1]), high=np.full(len(NAMES), np.inf))
     pose = kept("pose", lambda: minimise(residuals, posed, posed.mean, (*_POSE, "edge"), rounds=6).x)
-    mask, overlap = _compared(residuals, pose, mattes.cover[0], held)
+    mask, overlap, twin = _compared(residuals, pose, mattes.cover[0])
+    outlines = {"cover": mattes.cover, "twin": twin}
+
+    def check_needed(x: Array, some: slice, what: str) -> None:
+        """Refuse parameters of which some are too far from what is expected."""
+        needed = np.abs(x - space.mean)[some] / space.prior[some]
+        if needed.max() > BEYOND:
+            what += f" {NAMES[some][int(needed.argmax())]} off by {needed.max():.0f} times its prior"
+            raise clip.refused(what, hint="check the object, --size, --up, --held and the camera", **outlines)
+
+    check_needed(pose, CAMERA, "another object or size, or another camera: before it is let go they only fit with")
     if overlap < OVERLAP:
-        what = f"film {clip.name}: only {overlap:.0%} of object and picture overlap before it is let go"
-        raise FitError(what, hint="check --size, --up, the object and the camera of the scene, or give --plate")
+        what = f"only {overlap:.0%} of object and picture overlap before it is let go"
+        hint = "film it before another background, give --plate, or check --size, --up and the camera"
+        raise clip.refused(what, hint=hint, **outlines)
     residuals.mask(mask)
     early = every[clip.times <= release + EARLY]
     residuals.frames, residuals.moving = early, True
 
     tell("trying stiffnesses", 0.15)
-    sets = np.repeat(space.changed(pose, "start", space.mean[NAMES.index("start")])[None], len(SPECIFIC), axis=0)
+    sets = np.repeat(space.changed(pose, "start", space.mean[START])[None], len(SPECIFIC), axis=0)
     sets[:, 0] = np.log(SPECIFIC * material.density)
     costs = kept("costs", lambda: cost_of(residuals(sets)))
     none = space.changed(sets[0], "start", clip.times[-1])[None]
@@ -129,30 +144,26 @@ def fit_film(
     unmoved = residuals(none)[0]
     tell("fitting", 0.6)
     x = min(found, key=lambda one: float(one[0]))[1:]
-    x = kept("coverage", functools.partial(refined, space, x, NAMES))[1:]
+    x = kept("coverage", functools.partial(refined, space, x, names))[1:]
     tell("fitting with tracks", 0.8)
     residuals.anchor(tracks, x)
-    best = minimise(residuals, space, x, NAMES, rounds=6, lasting=_LASTING)
+    best = minimise(residuals, space, x, names, rounds=6, lasting=_LASTING)
     cover = best.residuals[: residuals.sizes[0]]
     followed = _followed(cover.reshape(len(every), -1), unmoved)
-    hint = "film one object that is held by one end and let go, before a background at rest"
     if followed < FOLLOWED and np.sqrt((cover**2).mean()) > LEFT:
-        what = f"film {clip.name}: not observable, because the twin follows {followed:.0%} of what moves"
-        raise FitError(what, hint=hint)
-    needed = np.abs(best.x - space.mean)[2:] / space.prior[2:]
-    if needed.max() > BEYOND:
-        name, beyond = NAMES[2 + int(needed.argmax())], needed.max()
-        what = f"film {clip.name}: not observable, because the twin needs {name} off by {beyond:.0f} times its prior"
-        raise FitError(what, hint=f"check camera, size and --held; {hint}")
+        hint = "film one object that is held by one end and let go, before a background at rest"
+        what = f"not observable, because the twin follows {followed:.0%} of what moves"
+        raise clip.refused(what, hint=hint, **outlines)
+    check_needed(best.x, slice(2, None), "not observable, because the twin needs")
     tell("the integrator's share", 0.95)
-    shift = integrator_shift(thing, material, best.x, float(clip.times[-1] - best.x[4]), residuals.worlds.dt, device)
+    shift = integrator_shift(thing, material, best.x, float(clip.times[-1] - best.x[START]), device)
     x = best.x.copy()
     x[:2] -= shift
-    told = _told(thing, clip, space, best, x, residuals, material, followed)
+    told = _told(residuals, best, x, material, followed, free)
     details = {
         "converged": best.converged,
         "camera": dict(zip(_POSE, best.x[CAMERA].tolist(), strict=True)) | {"nominal": asdict(camera)},
-        "start": float(best.x[4]),
+        "start": float(best.x[START]),
         "followed": followed,
         "tracks": len(residuals.tracks),
         "starts": [{"youngs_modulus": float(np.exp(one[1])), "cost": float(one[0])} for one in found],
@@ -166,7 +177,7 @@ def fit_film(
     return replace(told, details=details), residuals, best.x
 
 
-def _check_grip(residuals: FilmResiduals, area: NDArray[np.bool_]) -> None:
+def _check_grip(residuals: FilmResiduals, area: NDArray[np.bool_], twin: NDArray[np.float32]) -> None:
     """Refuse a film in which what is held, an area (H, W), moves about as the rest does."""
     cv2 = open_cv()
     soft = blurred(residuals.cover)
@@ -179,29 +190,25 @@ def _check_grip(residuals: FilmResiduals, area: NDArray[np.bool_]) -> None:
         flicker = float(np.quantile(np.abs(np.diff(soft[:, zone], axis=0)).mean(axis=1), 0.25))
         moves.append(float(np.quantile(change, 0.9)) - flicker)
     if moves[0] > max(0.15, 0.6 * moves[1]):
-        what = f"film {residuals.clip.name}: not observable, because the end that is held moves as the rest does"
-        raise FitError(what, hint="hold one end still, and let the rest go; what is thrown or poked shows no E")
+        what = "not observable, because the end that is held moves as the rest does"
+        hint = "hold one end still, and let the rest go; what is thrown or poked shows no E"
+        raise residuals.clip.refused(what, hint=hint, cover=residuals.cover, twin=twin)
 
 
 def _told(
-    thing: SoftObject,
-    clip: Clip,
-    space: Space,
-    best: Solution,
-    x: Array,
-    residuals: FilmResiduals,
-    material: Material,
-    followed: float,
+    residuals: FilmResiduals, best: Solution, x: Array, material: Material, followed: float, free: Sequence[str]
 ) -> Fitted:
     """Return what is told of a solution, with bars."""
-    deviation = dict(zip(best.free.tolist(), best.deviations(residuals.blocks()), strict=True))
-    bar = float(np.hypot(deviation[0] / max(followed, 0.01), floor_of(thing)))
+    thing, clip, space = residuals.thing, residuals.clip, best.space
+    deviation = dict(zip((NAMES[k] for k in best.free), best.deviations(residuals.blocks()).tolist(), strict=True))
+    bar = float(np.hypot(deviation["youngs_modulus"] / max(followed, 0.01), floor_of(thing)))
     at_end = min(x[0] - space.low[0], space.high[0] - x[0]) < 0.2
     why = "the film looks the same at every stiffness beyond it" if at_end else ""
     modulus = Estimate.of_logarithm(x[0], bar, unit="Pa", reason=why)
-    dies = deviation[1] > 0.5 or best.x[1] > space.high[1] - 0.1
+    dies = deviation["viscosity"] > 0.5 or best.x[1] > space.high[1] - 0.1
     swings = "its motion dies, or is too small, before a second swing is seen" if dies else ""
-    viscosity = Estimate.of_logarithm(x[1], float(np.hypot(deviation[1], 0.1)), unit="s", reason=swings)
+    spread = float(np.linalg.norm([deviation["viscosity"], 0.1, 2.0 * floor_of(thing)]))  # thin walls: 1.6 times, once
+    viscosity = Estimate.of_logarithm(x[1], spread, unit="s", reason=swings)
     notes = [f"from {len(clip.times)} frames and {len(residuals.tracks)} tracks"]
     frequency = first_frequency(thing, float(np.exp(x[0])), material)
     if frequency > 0.5 / clip.interval:
@@ -209,20 +216,12 @@ def _told(
             f"the object swings at {frequency:.3g} Hz, beyond half of the film's {1.0 / clip.interval:.3g} frames per"
             " second: film faster, or give --fps-true if it was"
         )
-    changes = {"youngs_modulus": modulus.value} if modulus.observable else {}
-    if viscosity.observable:
-        changes["viscosity"] = viscosity.value
-    return Fitted(
-        source=clip.name,
-        fingerprint=clip.fingerprint,
-        estimates={"youngs_modulus": modulus, "viscosity": viscosity},
-        material=replace(material, **changes),
-        notes=tuple(notes),
-    )
+    estimates = {"youngs_modulus": modulus, "viscosity": viscosity} | asked_for(free, material, space, x, deviation)
+    return Fitted.of(clip, estimates, material, notes)
 
 
-def _compared(residuals: FilmResiduals, x: Array, cover: Array, held: Held) -> tuple[Array, float]:
-    """Return where the film is compared (H, W): not on the holder; and how far object and matte overlap."""
+def _compared(residuals: FilmResiduals, x: Array, cover: Array) -> tuple[Array, float, Any]:
+    """Return where the film is compared (H, W): not on the holder; how far object and matte overlap; and the object."""
     cv2 = open_cv()
     q, poses = residuals.states(x[None])[0, :1], residuals.poses(x[None])[0, :1]
     alpha = residuals.pictures.draw(q, poses)[0]
@@ -236,10 +235,10 @@ def _compared(residuals: FilmResiduals, x: Array, cover: Array, held: Held) -> t
     shown = ((pixels >= 0) & (pixels < np.array(cover.shape[::-1]))).all(axis=1)
     spots[pixels[shown, 1], pixels[shown, 0]] = 1
     grip_area = cv2.dilate(spots, np.ones((5, 5))) > 0
-    _check_grip(residuals, grip_area)
+    _check_grip(residuals, grip_area, alpha)
     away = hand | grip_area
     both, one = (alpha > 0.5) & (cover > 0.5) & ~away, ((alpha > 0.5) | (cover > 0.5)) & ~away
-    return (~away).astype(np.float64), float(both.sum() / max(one.sum(), 1))
+    return (~away).astype(np.float64), float(both.sum() / max(one.sum(), 1)), alpha
 
 
 def _followed(r: Array, unmoved: Array) -> float:
@@ -261,14 +260,11 @@ def _followed(r: Array, unmoved: Array) -> float:
 
 def first_frequency(thing: SoftObject, youngs_modulus: float, material: Material) -> float:
     """Return about the lowest frequency of an object that one end holds [Hz]: that of a cantilever of its size."""
-    low, high = thing.body.bounds
-    span = np.sort(high - low)
+    span = np.sort(np.ptp(thing.body.bounds, axis=0))
     return 0.1615 * float(span[0]) / float(span[2]) ** 2 * float(np.sqrt(youngs_modulus / material.density))
 
 
-def integrator_shift(
-    thing: SoftObject, material: Material, x: Array, seconds: float, dt: float, device: wp.DeviceLike
-) -> Array:
+def integrator_shift(thing: SoftObject, material: Material, x: Array, seconds: float, device: wp.DeviceLike) -> Array:
     """Return by how much ln E and ln viscosity come out too large because of the steps, (2,).
 
     With steps of a quarter the body moves as it does with these steps and a little more of both; by how much is found
@@ -276,17 +272,16 @@ def integrator_shift(
     """
     rows = thing.body.surface.basis[:: max(1, thing.body.surface_count // 60)]
 
-    times = np.arange(0.0, seconds, 4.0 * dt)
+    times = np.arange(0.0, seconds, 4.0 * STEP)
 
     def motion(sets: Array, step: float) -> Array:
-        worlds = FitWorlds(thing.body, material, len(sets), dt=step, device=device)
+        worlds = HeldWorlds(thing.body, material, len(sets), dt=step, device=device)
         q = worlds.states(sets, np.zeros(len(sets)), times)
         return np.einsum("sk,wtkc->wtsc", rows, q).reshape(len(sets), -1)
 
-    sets = np.repeat(x[None, :4], 3, axis=0)
+    sets = np.repeat(x[None, : len(PHYSICS)], 3, axis=0)
     steps = np.array([0.02, 0.1])
-    sets[1, 0] += steps[0]
-    sets[2, 1] += steps[1]
-    coarse, fine = motion(sets, dt), motion(sets[:1], dt / 4.0)
+    sets[[1, 2], [0, 1]] += steps
+    coarse, fine = motion(sets, STEP), motion(sets[:1], STEP / 4.0)
     slopes = (coarse[1:] - coarse[0]) / steps[:, None]
     return np.linalg.lstsq(slopes.T, fine[0] - coarse[0], rcond=None)[0]

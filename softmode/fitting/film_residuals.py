@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 import warp as wp
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from softmode.deformables.materials.material import Material
@@ -15,19 +15,20 @@ from softmode.fitting.film import Clip, Mattes, blurred, open_cv
 from softmode.fitting.least_squares import Space
 from softmode.fitting.pictures import CoverPictures, project
 from softmode.fitting.tracks import Track
-from softmode.fitting.worlds import FitWorlds
+from softmode.fitting.worlds import PHYSICS, HeldWorlds, physics_rows
 from softmode.objects.soft_object import SoftObject
 from softmode.splats.raster.pinhole import PinholeCamera
 
 Array = NDArray[np.float64]
 NAMES = (
-    *("youngs_modulus", "viscosity", "tilt_x", "tilt_y", "start"),
+    *(*PHYSICS, "start"),
     *("camera_rx", "camera_ry", "camera_rz", "camera_x", "camera_y", "camera_z", "edge"),
     *("holder_x", "holder_y", "holder_z"),
 )
-"""Parameters: logarithms of Young's modulus [Pa] and viscosity [s], turns of gravity [rad], start of motion [s], turn
-and move of the camera in its own axes [rad, m], where the matte ends [px], where the holder goes at release [m]."""
-PHYSICS, CAMERA, HOLDER = slice(0, 4), slice(5, 11), slice(12, 15)
+"""Parameters: `PHYSICS`, start of motion [s], turn and move of the camera in its own axes [rad, m], where the matte
+ends [px], where the holder goes at release [m]."""
+START, EDGE = NAMES.index("start"), NAMES.index("edge")
+CAMERA, HOLDER = slice(START + 1, EDGE), slice(EDGE + 1, len(NAMES))
 STATIC_SHARE = 0.9
 """How much of the mean over time is taken off: what is wrong in every frame is no motion."""
 COVER_NOISE, TRACK_NOISE = 0.25, 0.5
@@ -38,15 +39,13 @@ HOLDER_TIME = 0.08
 """How fast the holder gives way at release [s]."""
 
 
-def film_space(release: float, interval: float, density: float) -> Space:
+def film_space(release: float, interval: float, material: Material) -> Space:
     """Return the parameters of a film whose last still frame is at a time, with frames at an interval [s]."""
-    mean = np.array([np.log(200.0 * density), np.log(3e-3), 0, 0, release, *np.zeros(10)])
-    prior = np.array([3.0, 1.5, 0.035, 0.035, 0.7 * interval, *[0.02] * 3, *[0.012] * 3, 0.5, *[0.002] * 3])
-    step = np.array([0.03, 0.1, 0.01, 0.01, 0.003, *[0.003] * 3, 0.002, 0.002, 0.003, 0.05, *[0.001] * 3])
-    low, high = np.full(15, -np.inf), np.full(15, np.inf)
-    low[:2], high[:2] = [np.log(3.0 * density), np.log(1e-4)], [np.log(3e4 * density), np.log(0.1)]
-    low[4], high[4] = release - 2.5 * interval, release + 2.5 * interval
-    return Space(names=NAMES, mean=mean, prior=prior, step=step, low=low, high=high)
+    inf = np.inf
+    start = (release, 0.7 * interval, 0.003, release - 2.5 * interval, release + 2.5 * interval)
+    turn, move, holder = (0.0, 0.02, 0.003, -inf, inf), (0.0, 0.012, 0.002, -inf, inf), (0.0, 0.002, 0.001, -inf, inf)
+    rows = [start, turn, turn, turn, move, move, (0.0, 0.012, 0.003, -inf, inf), (0.0, 0.5, 0.05, -inf, inf)]
+    return Space.of(physics_rows(material) | dict(zip(NAMES[START:], [*rows, holder, holder, holder], strict=True)))
 
 
 class FilmResiduals:
@@ -58,6 +57,8 @@ class FilmResiduals:
         clip: The film.
         mattes: What covers its background.
         camera: Where the camera should be, in the axes of the body frame, for the size of the film.
+        exposure: For how long a frame sees [s].
+        free: How many of `FREE` are fitted.
         device: Warp device.
     """
 
@@ -69,11 +70,14 @@ class FilmResiduals:
         mattes: Mattes,
         camera: PinholeCamera,
         *,
+        exposure: float = 0.0,
+        free: int = 0,
         device: wp.DeviceLike = None,
     ) -> None:
         """Allocate the worlds and the pictures."""
         self.thing, self.camera, self.clip = thing, camera, clip
-        self.worlds = FitWorlds(thing.body, material, WORLDS, dt=STEP, device=device)
+        self.worlds = HeldWorlds(thing.body, material, WORLDS + free, dt=STEP, device=device)
+        self._shots = exposure * np.array([-0.5, 0.5]) / np.sqrt(3.0) if exposure else np.zeros(1)  # Gauss's points
         self.pictures = CoverPictures(thing, camera, device=device)
         self.after: Callable[[], None] = lambda: None
         """Called after each batch."""
@@ -89,41 +93,42 @@ class FilmResiduals:
     def mask(self, mask: Array) -> None:
         """Compare pixels where a mask (H, W) is 1, and near the object."""
         cv2 = open_cv()
-        self._mask, self._target = mask, self._small(self.cover * mask)
+        self.region, self._target = mask, blurred(self.cover * mask)[:, ::2, ::2]
         near = cv2.dilate((self._target.max(axis=0) > 0.02).astype(np.uint8), np.ones((9, 9))) > 0
-        self._pixels = near & (self._small(mask[None])[0] > 0.99)
+        self._pixels = near & (blurred(mask[None])[0, ::2, ::2] > 0.99)
 
-    @staticmethod
-    def _small(pictures: Array) -> NDArray[np.float32]:
-        """Return pictures blurred, every second pixel."""
-        return blurred(pictures)[:, ::2, ::2]
+    def states(self, sets: Array, shots: ArrayLike = 0.0) -> Array:
+        """Return coordinates of parameters (W, p) in the frames, at so many times about each [s], (W, F S, n, 3)."""
+        return self.worlds.states(sets[:, : len(PHYSICS)], sets[:, START], self._times(shots))
 
-    def states(self, sets: Array) -> Array:
-        """Return coordinates of parameters (W, p) in the frames, shape (W, F, n, 3)."""
-        return self.worlds.states(sets[:, PHYSICS], sets[:, 4], self.clip.times[self.frames])
+    def _times(self, shots: ArrayLike) -> Array:
+        """Return the times of the frames and of some about each [s], (F S,)."""
+        return np.add.outer(self.clip.times[self.frames], np.atleast_1d(shots)).ravel()
 
-    def poses(self, sets: Array) -> Array:
-        """Return from the world to the camera, with what the holder does, shape (W, F, 4, 4)."""
-        times = self.clip.times[self.frames]
+    def poses(self, sets: Array, shots: ArrayLike = 0.0) -> Array:
+        """Return from the world to the camera, with what the holder does, shape (W, F S, 4, 4)."""
+        times = self._times(shots)
         poses = np.empty((len(sets), len(times), 4, 4))
         for x, out in zip(sets, poses, strict=True):
             moved = np.eye(4)
             moved[:3, :3] = Rotation.from_rotvec(x[CAMERA][:3]).as_matrix()
             moved[:3, 3] = -x[CAMERA][3:]
             out[:] = moved @ self.camera.world_to_camera
-            gone = 1.0 - np.exp(-np.maximum(times - x[4], 0.0) / HOLDER_TIME)
+            gone = 1.0 - np.exp(-np.maximum(times - x[START], 0.0) / HOLDER_TIME)
             out[:, :3, 3] += (gone[:, None] * x[HOLDER]) @ out[0, :3, :3].T
         return poses
 
     def __call__(self, sets: Array) -> Array:
         """Return the residuals (W, M) of parameters (W, p), in units of their noise."""
-        q, poses = self.states(sets), self.poses(sets)
-        count, frames = q.shape[:2]
+        q, poses = self.states(sets, self._shots), self.poses(sets, self._shots)
+        count, frames = len(sets), len(self.frames)
         drawn = self.pictures.draw(q.reshape(-1, *q.shape[2:]), poses.reshape(-1, 4, 4))
-        small = self._small(drawn * self._mask).reshape(count, frames, *self._target.shape[1:])
+        q, poses = (a.reshape(count, frames, -1, *a.shape[2:]).mean(axis=2) for a in (q, poses))
+        drawn = drawn.reshape(count * frames, -1, *drawn.shape[1:]).mean(axis=1)
+        small = blurred(drawn * self.region)[:, ::2, ::2].reshape(count, frames, *self._target.shape[1:])
         rows, columns = np.gradient(small, axis=(2, 3))
         slope = np.hypot(rows, columns)
-        r = (small + sets[:, 11, None, None, None] * slope - self._target[self.frames])[:, :, self._pixels]
+        r = (small + sets[:, EDGE, None, None, None] * slope - self._target[self.frames])[:, :, self._pixels]
         if self.moving:
             r = r - STATIC_SHARE * r.mean(axis=1, keepdims=True)
         out = [r.reshape(count, -1) / COVER_NOISE, *self._track_residuals(q, poses)]

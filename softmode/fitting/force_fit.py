@@ -15,20 +15,14 @@ from softmode.checks import require_number, require_numbers
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body
-from softmode.deformables.model.status import (
-    WORLD_COLLAPSED,
-    WORLD_CONTACT_OVERFLOW,
-    WORLD_NOT_FINITE,
-    status_reasons,
-)
+from softmode.deformables.model.status import WORLD_COLLAPSED, WORLD_CONTACT_OVERFLOW, WORLD_NOT_FINITE, status_reasons
 from softmode.deformables.model.tables import present
-from softmode.deformables.solver.solver_reduced import SolverReduced
 from softmode.errors import ConfigError, FitError, SolverDiverged
 from softmode.fitting.estimates import Estimate, Fitted, floor_of
 from softmode.fitting.tables import ForceLog
+from softmode.fitting.worlds import FitWorlds
 from softmode.objects.frame import in_body
 from softmode.objects.soft_object import SoftObject
-from softmode.scenes.capture import capture_graph
 
 Array = NDArray[np.float64]
 START = 1.0e5
@@ -89,34 +83,27 @@ class Press:
             start, toward = low + high - behind, -axis
             world.add_shape_box(press, **plate)
         builder.replicate(world, len(depths))
-        model = builder.finalize(device=device)
+        worlds = FitWorlds(builder.finalize(device=device), body, dt=STEP)
         # the file has the object as it rests, and forces are those beyond its weight
-        model.set_gravity((0.0, 0.0, 0.0))
-        solver, states = SolverReduced(model, [body]), (model.state(), model.state())
-        poses = present(states[0].body_q).numpy()
+        worlds.model.set_gravity((0.0, 0.0, 0.0))
+        poses = present(worlds.pair[0].body_q).numpy()
         poses[:, 3:] = (0.0, 0.0, 0.0, 1.0)
-
-        def both() -> None:
-            solver.step(states[0], states[1], None, None, STEP)
-            solver.step(states[1], states[0], None, None, STEP)
 
         def place(share: float) -> None:
             poses[:, :3] = start + toward * (share * depths)[:, None]
-            for state in states:
+            for state in worlds.pair:
                 present(state.body_q).assign(poses)
 
         place(0.0)
-        graph = capture_graph(both, model.device)
-        for state in states:
-            solver.reset(state)
+        worlds.reset()
         for k in range((RAMP + REST) // 2):
             place(min(1.0, (2 * k + 2) / RAMP))
-            graph.launch()
-        for depth, bits in zip(depths, solver.status.numpy(), strict=True):
+            worlds.step_twice()
+        for depth, bits in zip(depths, worlds.solver.status.numpy(), strict=True):
             if bits & FAILED:
                 what = f"{1e3 * depth:.3g} mm deep: {', '.join(status_reasons(int(bits)))}"
                 raise SolverDiverged(what, hint="check the units of the depths, the place and the size of the object")
-        wrench = solver.body_wrench.numpy().reshape(len(depths), -1)[:, :3]
+        wrench = worlds.solver.body_wrench.numpy().reshape(len(depths), -1)[:, :3]
         return -(wrench @ toward)
 
     def _contact(self, body: ReducedBody, place: ArrayLike) -> tuple[Array, Array]:
@@ -189,9 +176,8 @@ def fit_force(
     modulus = START * factor
     inverse = np.linalg.inv(found.jac.T @ found.jac)
     spread = float(np.sqrt(inverse[0, 0] * max(2.0 * found.cost / max(len(way) - 2, 1), 0.1)))
-    estimate = Estimate.of_logarithm(
-        np.log(modulus), float(np.hypot(spread, floor_of(thing) if press.point is None else BALL)), unit="Pa"
-    )
+    bar = float(np.hypot(spread, floor_of(thing) if press.point is None else BALL))
+    estimate = Estimate.of_logarithm(np.log(modulus), bar, unit="Pa")
     curve = factor * _curve(depths, made, way - shift)
     shallow, deep = (
         modulus * float(force[part].sum() / max(curve[part].sum(), 1e-12))
@@ -204,11 +190,5 @@ def fit_force(
             f"no single E fits: {shallow / 1e3:.3g} kPa when it is pressed a little, {deep / 1e3:.3g} kPa at the end,"
             f" as {law} does"
         )
-    return Fitted(
-        source=log.source,
-        fingerprint=log.fingerprint,
-        estimates={"youngs_modulus": estimate},
-        material=replace(material, youngs_modulus=modulus) if estimate.observable else material,
-        notes=tuple(notes),
-        details={"depths": depths.tolist(), "forces": (factor * made).tolist(), "touch": shift},
-    )
+    details = {"depths": depths.tolist(), "forces": (factor * made).tolist(), "touch": shift}
+    return Fitted.of(log, {"youngs_modulus": estimate}, material, notes, **details)

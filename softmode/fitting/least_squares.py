@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,8 @@ HUBER = 2.5
 """Residuals beyond this count by their size and not by its square."""
 TOLERANCE = 1.0e-3
 """Relative change of the cost, and of the parameters in their priors, at which it ends."""
+
+_FIELDS = ("mean", "prior", "step", "low", "high")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -37,6 +40,11 @@ class Space:
     high: Array
     """Largest values (p,)."""
 
+    @classmethod
+    def of(cls, rows: Mapping[str, Sequence[float]]) -> Space:
+        """Return the space of rows: mean, prior, step, least and largest value of each parameter."""
+        return cls(names=tuple(rows), **dict(zip(_FIELDS, np.array(list(rows.values())).T, strict=True)))
+
     def changed(self, values: Array, name: str, value: float) -> Array:
         """Return values (p,) with another one of a parameter."""
         return np.where(np.arange(len(self.names)) == self.names.index(name), value, values)
@@ -50,8 +58,10 @@ class Space:
 class Solution:
     """Where least squares ended."""
 
+    space: Space
+    """The parameters."""
     x: Array
-    """Parameters (p,)."""
+    """Their values (p,)."""
     free: NDArray[np.intp]
     """Which of them were free (k)."""
     converged: bool
@@ -68,8 +78,10 @@ class Solution:
     def deviations(self, blocks: Sequence[NDArray[np.intp]]) -> Array:
         """Return standard deviations of the free parameters, (k,).
 
-        Of two the larger: that of Gauss and Newton with the priors, times chi where it is above one, and that of the
-        sandwich over blocks of residuals which may err together (White 1980, doi:10.2307/1912934).
+        Of two the larger: that of Gauss and Newton with the priors, times chi where it is above one, and the jackknife
+        over blocks of residuals that may err together (MacKinnon and White 1985, doi:10.1016/0304-4076(85)90158-7): a
+        plain sandwich is too small where a few blocks, such as the first swing, tell most. Where the search ran
+        out of rounds, the step that is left to the least cost counts as an error too.
 
         Args:
             blocks: Indices of residuals.
@@ -80,19 +92,16 @@ class Solution:
         moved = np.abs(J).sum(axis=1)
         active = moved > 1e-3 * moved.max()
         chi = float((w * r * r)[active].sum() / max(int(active.sum()) - len(self.free), 1))
-        scores = np.array([J[b].T @ (w * r)[b] for b in blocks])
+        without = [np.eye(len(inverse)) - J[b].T @ (w[b, None] * J[b]) @ inverse for b in blocks]
+        scores = np.array([np.linalg.solve(a, J[b].T @ (w * r)[b]) for a, b in zip(without, blocks, strict=True)])
         sandwich = inverse @ (scores.T @ scores + np.diag(1.0 / self.prior**2)) @ inverse
-        return np.sqrt(np.maximum(np.diag(inverse) * max(chi, 1.0), np.diag(sandwich)))
+        away = (self.x - self.space.mean)[self.free] / self.prior**2
+        left = (not self.converged) * (inverse @ (J.T @ (w * r) + away))
+        return np.hypot(np.sqrt(np.maximum(np.diag(inverse) * max(chi, 1.0), np.diag(sandwich))), left)
 
 
 def minimise(
-    residuals: Residuals,
-    space: Space,
-    start: Array,
-    free: Sequence[str],
-    *,
-    rounds: int,
-    lasting: Sequence[str] = (),
+    residuals: Residuals, space: Space, start: Array, free: Sequence[str], *, rounds: int, lasting: Sequence[str] = ()
 ) -> Solution:
     """Find the parameters of least residuals near a start.
 
@@ -125,41 +134,24 @@ def minimise(
                 slopes[:, rows] = fresh
             latest[:] = [slopes]
             known.clear()
-            known[key] = (
-                np.append(found[0], (y - mean) / prior),
-                np.vstack([slopes, np.diag(1.0 / prior)]),
-            )
+            known[key] = np.append(found[0], (y - mean) / prior), np.vstack([slopes, np.diag(1.0 / prior)])
             counted.append(1)
         return known[key]
 
     counted: list[int] = []
     latest: list[Array] = []
     lasts = np.isin(np.array(free), lasting)
-    found = least_squares(
-        lambda y: batch(y)[0],
-        np.clip(start[which], space.low[which] + 1e-9, space.high[which] - 1e-9),
-        jac=lambda y: batch(y)[1],  # type: ignore[arg-type]
-        bounds=(space.low[which], space.high[which]),
-        loss="huber",
-        f_scale=HUBER,
-        x_scale=np.where(np.isfinite(prior), prior, 1.0),
-        ftol=TOLERANCE,
-        xtol=TOLERANCE,
-        max_nfev=rounds,
-    )
+    low, high, scale = space.low[which], space.high[which], np.where(np.isfinite(prior), prior, 1.0)
+    how: dict[str, Any] = {"loss": "huber", "f_scale": HUBER, "ftol": TOLERANCE, "xtol": TOLERANCE, "max_nfev": rounds}
+    begin = np.clip(start[which], low + 1e-9, high - 1e-9)
+    how |= {"jac": lambda y: batch(y)[1], "bounds": (low, high), "x_scale": scale}
+    found = least_squares(lambda y: batch(y)[0], begin, **how)
     r, J = batch(found.x)
     x = start.copy()
     x[which] = found.x
     m = len(r) - len(which)
-    return Solution(
-        x=x,
-        free=which,
-        converged=found.status > 0,
-        cost=float(found.cost),
-        residuals=r[:m],
-        jacobian=J[:m],
-        prior=prior,
-    )
+    told: dict[str, Any] = {"converged": found.status > 0, "cost": float(found.cost)}
+    return Solution(space=space, x=x, free=which, residuals=r[:m], jacobian=J[:m], prior=prior, **told)
 
 
 def cost_of(residuals: Array) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
@@ -11,16 +11,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from softmode.deformables.materials.material import Material
 from softmode.errors import ConfigError, FitError
-from softmode.fitting.estimates import Estimate, Fitted
+from softmode.fitting.estimates import Estimate, Fitted, asked_for
 from softmode.fitting.film_fit import SPECIFIC
-from softmode.fitting.least_squares import Space, cost_of, minimise
+from softmode.fitting.least_squares import Solution, Space, cost_of, minimise
 from softmode.fitting.tables import Markers
-from softmode.fitting.worlds import FitWorlds
+from softmode.fitting.worlds import FREE, HeldWorlds, physics_rows
 from softmode.objects.frame import in_body
 from softmode.objects.soft_object import SoftObject
 
 Array = NDArray[np.float64]
-NAMES = ("youngs_modulus", "viscosity", "tilt_x", "tilt_y", "start")
 REST = 1.0
 """Last part of a take in which the object has to hang still, for its sag [s]."""
 STILL = 0.02
@@ -77,12 +76,7 @@ class MarkerFit:
     """
 
     def __init__(
-        self,
-        thing: SoftObject,
-        places: MarkerPlaces,
-        *,
-        material: Material,
-        device: wp.DeviceLike = None,
+        self, thing: SoftObject, places: MarkerPlaces, *, material: Material, device: wp.DeviceLike = None
     ) -> None:
         """Find the functions at the markers."""
         if not places.points:
@@ -97,14 +91,19 @@ class MarkerFit:
             name = list(places.points)[int(off.argmax())]
             raise ConfigError(f"marker {name} lies {off.max():.3g} m from the object", hint="check places and --size")
         self._basis = body.evaluate(rest)[0]
-        self._load: Array | None = None
+        self._load = np.zeros((body.surface_count, 3))
         if any(places.load):
             if places.load_at is None:
                 raise ConfigError("load hangs nowhere", hint='say where: "load": {"force": [...], "at": [x, y, z]}')
             at = in_body(body, places.load_at)
             near = np.argsort(np.linalg.norm(body.surface.points - at, axis=1))[:LOADED]
-            self._load = np.zeros((body.surface_count, 3))
             self._load[near] = np.array(places.load) / len(near)
+
+    def _worlds(self, count: int, dt: float) -> HeldWorlds:
+        """Return worlds of the object with the load on it."""
+        worlds = HeldWorlds(self.thing.body, self.material, count, dt=dt, device=self._device)
+        worlds.hang(self._load)
+        return worlds
 
     def moved(self, markers: Markers) -> Array:
         """Return how far the markers are from where they were before the release [m], (F, M, 3), in the object's axes.
@@ -119,7 +118,7 @@ class MarkerFit:
     def sag(self, moduli: ArrayLike) -> Array:
         """Return where the markers rest under gravity and the load, for each Young's modulus [m], (W, M, 3)."""
         moduli = np.atleast_1d(np.asarray(moduli, float))
-        worlds = FitWorlds(self.thing.body, self.material, len(moduli), dt=0.05, load=self._load, device=self._device)
+        worlds = self._worlds(len(moduli), 0.05)
         q = worlds.run({"youngs_modulus": moduli, "viscosity": 0.05}, 8.0, every=160)[1]
         return np.einsum("mk,wkc->wmc", self._basis, q[-1] - q[0])
 
@@ -133,41 +132,42 @@ class MarkerFit:
         at = np.interp(np.log(sag), np.log(down[::-1]), np.log(moduli)[::-1], left=np.nan, right=np.nan)
         return float(np.exp(at))
 
-    def fit_motion(self, markers: Markers) -> tuple[Array, Array, float]:
+    def fit_motion(self, markers: Markers, free: Sequence[str] = ()) -> tuple[Solution, dict[str, float], float]:
         """Fit the motion after the release.
 
+        Args:
+            markers: Where they are.
+            free: Which of `FREE` are fitted.
+
         Returns:
-            Parameters as `NAMES` has them, their standard deviations, and the rms of what is left [m].
+            The solution, of which the last parameter is the start of the motion; the standard deviations of its free
+            parameters by name; and the rms of what is left [m].
         """
         moved, markers = self.moved(markers), markers.of(list(self.places.points))
         release = markers.times[markers.release]
         last = min(len(moved) - 1, int(np.searchsorted(markers.times, release + 1.5)))
         frames = np.arange(markers.release, last + 1)
         times, noise = markers.times[frames], max(markers.noise, 2.0e-4)
-        worlds = FitWorlds(self.thing.body, self.material, 5, dt=STEP, load=self._load, device=self._device)
+        worlds = self._worlds(5 + len(free), STEP)
         interval = float(np.median(np.diff(markers.times)))
-        space = Space(
-            names=NAMES,
-            mean=np.array([np.log(300.0 * self.material.density), np.log(4e-3), 0.0, 0.0, release]),
-            prior=np.array([3.0, 1.5, 0.035, 0.035, 2.0 * interval]),
-            step=np.array([0.02, 0.1, 0.01, 0.01, 0.002]),
-            low=np.array([np.log(3.0 * self.material.density), np.log(1e-4), -0.3, -0.3, release - 0.05]),
-            high=np.array([*[np.inf] * 4, release + 0.05]),
-        )
+        start = (release, 2.0 * interval, 0.002, release - 0.05, release + 0.05)
+        space = Space.of({**physics_rows(self.material), "start": start})
+        names = [name for name in space.names if name not in FREE or name in free]
 
         def residuals(sets: Array) -> Array:
-            q = worlds.states(sets[:, :4], sets[:, 4], times)  # zero at rest
+            q = worlds.states(sets[:, :-1], sets[:, -1], times)  # zero at rest
             return ((np.einsum("mk,wtkc->wtmc", self._basis, q) - moved[frames]) / noise).reshape(len(sets), -1)
 
         starts = np.repeat(space.mean[None], len(SPECIFIC), axis=0)
         starts[:, 0] = np.log(SPECIFIC * self.material.density)
         costs = cost_of(residuals(starts))
         best = min(
-            (minimise(residuals, space, starts[k], NAMES, rounds=12) for k in np.argsort(costs)[:2]),
+            (minimise(residuals, space, starts[k], names, rounds=12) for k in np.argsort(costs)[:2]),
             key=lambda one: one.cost,
         )
         blocks = np.array_split(np.arange(len(best.residuals)).reshape(len(frames), -1), 12)
-        return best.x, best.deviations([b.ravel() for b in blocks]), float(np.sqrt((best.residuals**2).mean()) * noise)
+        deviations = dict(zip(names, best.deviations([b.ravel() for b in blocks]), strict=True))
+        return best, deviations, float(np.sqrt((best.residuals**2).mean()) * noise)
 
 
 def fit_markers(
@@ -176,6 +176,7 @@ def fit_markers(
     places: MarkerPlaces,
     *,
     material: Material,
+    free: Sequence[str] = (),
     device: wp.DeviceLike = None,
 ) -> Fitted:
     """Fit Young's modulus and viscosity to the motion of markers, and Young's modulus to where they come to rest.
@@ -185,23 +186,23 @@ def fit_markers(
         markers: Where they are.
         places: How they lie on the object.
         material: Density and Poisson's ratio.
+        free: What is fitted besides, of `worlds.FREE` and `estimates.UNSEEN`.
         device: Warp device.
 
     Raises:
         FitError: If nothing moves.
     """
     fit = MarkerFit(thing, places, material=material, device=device)
-    x, deviation, left = fit.fit_motion(markers)
-    moved = fit.moved(markers)
+    best, deviation, left = fit.fit_motion(markers, [name for name in free if name in FREE])
+    x, moved = best.x, fit.moved(markers)
     if left > 0.4 * float(np.sqrt((moved**2).mean())):
         what = f"{markers.source}: not observable, because the twin does not follow the markers ({1e3 * left:.2g} mm)"
         raise FitError(what, hint="check places and axes of the markers, --held, and that it is let go")
-    motion = Estimate.of_logarithm(x[0], float(np.hypot(deviation[0], PLACE)), unit="Pa")
+    motion = Estimate.of_logarithm(x[0], float(np.hypot(deviation["youngs_modulus"], PLACE)), unit="Pa")
     estimates = {"youngs_modulus": motion}
     notes = [f"what is left of the motion: {1e3 * left:.2g} mm rms"]
     tail = markers.times > markers.times[-1] - REST
     ways = np.linalg.norm(moved, axis=2)
-    changes = {"youngs_modulus": motion.value} if motion.observable else {}
     if ways[tail].std(axis=0).max() < STILL * ways.max() and tail.sum() > 5:
         still = fit.fit_rest(moved[tail].mean(axis=0), motion.value)
         stiffer = motion.value / still - 1.0
@@ -210,19 +211,9 @@ def fit_markers(
         else:
             at_rest = Estimate.of_logarithm(float(np.log(still)), PLACE, unit="Pa")
             estimates = {"youngs_modulus": at_rest, "youngs_modulus_in_motion": motion}
-            changes["youngs_modulus"] = still
-        if abs(stiffer) > 3.0 * deviation[0]:
+        if abs(stiffer) > 3.0 * deviation["youngs_modulus"]:
             word = "stiffer" if stiffer > 0 else "softer"
             notes.append(f"{word} in motion by {abs(stiffer):.0%}: the material is rate dependent")
-    viscosity = Estimate.of_logarithm(x[1], float(np.hypot(deviation[1], 0.1)), unit="s")
-    estimates["viscosity"] = viscosity
-    if viscosity.observable:
-        changes["viscosity"] = viscosity.value
-    return Fitted(
-        source=markers.source,
-        fingerprint=markers.fingerprint,
-        estimates=estimates,
-        material=replace(material, **changes),
-        notes=tuple(notes),
-        details={"start": float(x[4]), "rms": left},
-    )
+    viscosity = Estimate.of_logarithm(x[1], float(np.hypot(deviation["viscosity"], 0.1)), unit="s")
+    estimates |= {"viscosity": viscosity} | asked_for(free, material, best.space, x, deviation)
+    return Fitted.of(markers, estimates, material, notes, start=float(x[-1]), rms=left)

@@ -56,7 +56,5 @@ def project(camera: PinholeCamera, poses: Array, points: Array) -> tuple[Array, 
     """Return pixels (..., 2) and forward depths [m] of points (..., 3) of the world, with poses (..., 4, 4)."""
     seen = (poses[..., :3, :3] @ points[..., None])[..., 0] + poses[..., :3, 3]
     depth = seen[..., 2]
-    return np.stack([camera.fx * seen[..., 0], camera.fy * seen[..., 1]], axis=-1) / depth[..., None] + [
-        camera.cx,
-        camera.cy,
-    ], depth
+    pixels = np.stack([camera.fx * seen[..., 0], camera.fy * seen[..., 1]], axis=-1) / depth[..., None]
+    return pixels + np.array([camera.cx, camera.cy]), depth

@@ -170,13 +170,8 @@ def read_forces(path: Path) -> ForceLog:
         hint = "give columns like depth [mm],force [N], or opening [mm],force [N]"
         raise FitError(f"force log {path}: has columns {', '.join(titles)}", hint=hint)
     good = np.isfinite(columns[way]) & np.isfinite(columns["force"])
-    log = ForceLog(
-        way=columns[way][good],
-        force=columns["force"][good],
-        opening=way == "opening",
-        source=str(path),
-        fingerprint=file_fingerprint(path),
-    )
+    told = {"source": str(path), "fingerprint": file_fingerprint(path)}
+    log = ForceLog(way=columns[way][good], force=columns["force"][good], opening=way == "opening", **told)
     if len(log.way) < 4 or not log.force.max() > 0.0 or np.ptp(log.way) == 0.0:
         raise FitError(f"force log {path}: nothing presses", hint="give forces > 0 at four depths or more")
     return log

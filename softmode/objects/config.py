@@ -9,6 +9,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from softmode.checks import require_choice, require_fields, require_number
+from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.materials.material import Material
 from softmode.deformables.quadrature.surface_samples import SURFACE_COUNT
 from softmode.deformables.reduction.options import BuildOptions
@@ -139,6 +140,9 @@ class ObjectConfig:
     """The same for `density_file`."""
     material_fingerprint: str | None = None
     """The same for `material_file`."""
+    fitted: str | None = None
+    """What `softmode fit` found of a body that is a .npz, as JSON: its film's fingerprint, values and bars; written by
+    `pinned`, so that datasets and checkpoints tell it."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -227,7 +231,7 @@ class ObjectConfig:
     def changed(self, **options: Any) -> ObjectConfig:
         """Return this with other options; another file comes without the fingerprint of the one before."""
         if any(options.get(kind) is not None for kind in FILES):
-            options = {"fingerprint": None, **options}
+            options = {"fingerprint": None, "fitted": None, **options}
         for name, its in FIELD_FILES.items():
             if options.get(name) is not None:
                 options = {its: None, **options}
@@ -250,6 +254,8 @@ class ObjectConfig:
         for name, (path, its) in self.files.items():
             if getattr(self, its) is None:
                 changes |= {name: str(path.resolve()), its: file_fingerprint(path)}
+                if name == "body" and path.suffix.lower() == ".npz":
+                    changes["fitted"] = ReducedBody.load(path).provenance.get("fit")
         return replace(self, **changes) if changes else self
 
     def located(self) -> ObjectConfig:

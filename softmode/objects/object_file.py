@@ -89,6 +89,12 @@ def stored_material(body: ReducedBody) -> dict[str, float]:
     return json.loads(str(body.provenance.get("material", "{}")))
 
 
+def stored_bars(body: ReducedBody) -> dict[str, tuple[float, float, float]]:
+    """Return low, value and high of what `softmode fit` found of a body by fields of `Material`; none if it did not."""
+    told = json.loads(str(body.provenance.get("fit", "{}")))
+    return {name: tuple(bars) for name, bars in told.get("parameters", {}).items()}
+
+
 def file_kind(path: str | os.PathLike[str]) -> FileKind:
     """Return what a file is, by its suffix and, for .ply, .npz and OpenUSD, its contents.
 

@@ -43,8 +43,10 @@ from softmode.envs.tasks.place_in_bin.task import PlaceInBin
 from softmode.envs.tasks.rope_route.task import RopeRoute, rope_scene
 from softmode.envs.tasks.shape_soft.config import POST
 from softmode.errors import ConfigError, GraspError, StateError
+from softmode.fitting.estimates import Estimate, Fitted
+from softmode.fitting.tables import ForceLog
 from softmode.learning.config_values import config_of, pinned_options, values_of
-from softmode.objects import ObjectConfig, ObjectSet
+from softmode.objects import ObjectConfig, ObjectSet, load
 from softmode.scenes import BoundSplats
 from softmode.splats import make_plush, write_splats
 from tests.envs.object_kinds import (
@@ -256,11 +258,22 @@ def test_ropes_are_ropes() -> None:
             RopeRouteEnv(config=RopeRouteConfig(objects=given), device="cpu")
 
 
-def test_states_of_different_objects_go_on_as_they_did() -> None:
-    """After a state, in bytes, all goes on with the same bits; a world takes another one's that has its object."""
-    config = lift(replace(SET, objects=(CUBE, BALL), materials=None), youngs_modulus_range=(2.0e4, 2.0e6))
+def test_states_of_different_objects_go_on_as_they_did(tmp_path: Path) -> None:
+    """After a state, in bytes, all goes on with the same bits; a world takes another one's that has its object.
+
+    E of what `softmode fit` made is drawn within its bars, others keep theirs, and what a run keeps tells the fit.
+    """
+    modulus = Estimate(value=5.0e4, low=4.0e4, high=6.25e4, observable=True, unit="Pa")
+    film = ForceLog(way=np.zeros(1), force=np.zeros(1), opening=False, source="press.csv", fingerprint="00ff")
+    Fitted.of(film, {"youngs_modulus": modulus}, MATERIALS[0], ()).save(tmp_path / "toy.npz", load(CUBE))
+    toy = ObjectConfig(body=tmp_path / "toy.npz").pinned()
+    config = lift(replace(SET, objects=(toy, BALL), materials=None))
+    told = json.loads(values_of(config)["objects"]["objects"][0]["fitted"])
+    assert told["fingerprint"] == "00ff" and told["parameters"]["youngs_modulus"] == [4.0e4, 5.0e4, 6.25e4]
     env = LiftSoftVectorEnv(3, config=config, device="cpu")
-    env.reset(seed=4, options=PLACE)
+    first, other, second = env.reset(seed=4, options=PLACE)[1]["parameters"]["youngs_modulus"]
+    assert 4.0e4 <= first <= 6.25e4 and 4.0e4 <= second <= 6.25e4 and first != second
+    assert other == np.float32(config.scene.material.youngs_modulus)
 
     def play(first: int) -> list[tuple[np.ndarray, np.ndarray]]:
         return [env.step(actions(3, step))[:2] for step in range(first, first + 6)]
@@ -272,7 +285,7 @@ def test_states_of_different_objects_go_on_as_they_did() -> None:
     for mine, theirs in zip(play(16), after, strict=True):
         np.testing.assert_array_equal(mine[0], theirs[0])
         np.testing.assert_array_equal(mine[1], theirs[1])
-    env.set_state(env.get_state().worlds([2, 1, 2]), mask=np.array([True, False, False]))  # worlds 0 and 2: cubes
+    env.set_state(env.get_state().worlds([2, 1, 2]), mask=np.array([True, False, False]))  # worlds 0 and 2: toys
     same = np.tile(actions(1, 30), (3, 1))
     observation = env.step(same)[0]
     np.testing.assert_array_equal(observation[0], observation[2])

@@ -45,13 +45,15 @@ NONE = Trouble(light=0.0, noise=0.005, pose=0.0, colors=0.0, background=0.0, lat
 """A film without trouble."""
 
 
-def film_camera(thing: SoftObject, size: int) -> PinholeCamera:
-    """Return a camera that sees an object and where it may sag, in the axes of its file."""
+def film_camera(thing: SoftObject, size: int, azimuth: float = 0.0) -> PinholeCamera:
+    """Return a camera that sees an object and where it may sag, in the axes of its file, turned about it [rad]."""
     low, high = thing.body.bounds + thing.body.offset
     span, middle = float((high - low).max()), 0.5 * (low + high)
     target = (float(middle[0]), float(middle[1]), float(middle[2]) - 0.15 * span)
     d = 2.2 * span
-    place = (target[0] + 0.25 * d, target[1] - 0.95 * d, target[2] + 0.25 * d)
+    c, s = np.cos(azimuth), np.sin(azimuth)
+    aside = d * (0.25 * c + 0.95 * s), d * (0.25 * s - 0.95 * c)
+    place = (target[0] + aside[0], target[1] + aside[1], target[2] + 0.25 * d)
     return PinholeCamera.look_at("film", position=place, target=target, width=size, height=size, fov_y=0.75)
 
 
@@ -79,6 +81,7 @@ def make_film(
     seconds: float = 0.9,
     fps: int = 30,
     size: int = 128,
+    azimuth: float = 0.0,
     dt: float = 1.0 / 960.0,
     moved: tuple[Array, newton.Model] | None = None,
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8], PinholeCamera]:
@@ -92,12 +95,13 @@ def make_film(
         seconds: How long [s].
         fps: Frames per second.
         size: Width and height [px].
+        azimuth: Turn of the camera about the object [rad].
         dt: Steps of the truth [s].
         moved: The truth's motion at every second step, where it is another one's.
     """
     r = np.random.default_rng(seed)
     q, model = moved or motion(thing, material, seconds + 0.1, dt)
-    told = film_camera(thing, size)
+    told = film_camera(thing, size, azimuth)
     axis, move = r.normal(size=3), r.normal(size=3)
     turn = Rotation.from_rotvec(np.deg2rad(trouble.pose) * axis / np.linalg.norm(axis)) * Rotation.from_quat(told.quat)
     place = np.add(told.position, 0.01 * trouble.pose * move / np.linalg.norm(move)) - thing.body.offset

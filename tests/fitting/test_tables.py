@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from softmode.cli.main import main
 from softmode.errors import AssetError, ConfigError, FitError
 from softmode.fitting.marker_fit import MarkerPlaces
 from softmode.fitting.tables import holds_forces, read_forces, read_markers
@@ -69,6 +70,30 @@ def test_forces_have_units(tmp_path: Path) -> None:
     path.write_text("depth [mm],force [N]\n0,0\n1,one\n2,0\n3,0\n")
     with pytest.raises(AssetError, match="one"):
         read_forces(path)
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        (["--between", "y", "--radius", "0.01"], "--radius says nothing about jaws"),
+        (["--between", "y", "--exposure", "0.01"], "--exposure says nothing about a force log"),
+        (["--between", "y", "--free", "friction"], "free says nothing about a force log"),
+        (["--between", "y", "--scene", "press.json"], "kind is 'press'"),
+    ],
+)
+def test_options_that_say_nothing_are_refused(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    options: list[str],
+    match: str,
+) -> None:
+    """An option of a ball between jaws, of a film, of what moves, and a scene of another kind: none is ignored."""
+    monkeypatch.chdir(tmp_path)
+    Path("f.csv").write_text("depth [mm],force [N]\n0,0\n1,1\n2,2\n3,3\n")
+    Path("press.json").write_text('{"kind": "press"}')
+    assert main(["fit", "f.csv", "--object", "sponge", *options]) == 2
+    assert match in capsys.readouterr().err
 
 
 def test_axes_of_markers() -> None:
