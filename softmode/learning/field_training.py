@@ -43,8 +43,8 @@ EIKONAL, SMOOTH, EVEN = 1.0e-2, 1.0e-3, 1.0e-3
 """Weights of (|grad s| - 1)^2, on the fine grid, of the curvature of s and of the differences of colours."""
 BAND, AGAIN = 4.0, 150
 """Distance from the surface up to which nodes are learned [voxels], and steps after which it is found anew."""
-EMPTY, THIN = 6.0e-8, 6.0e-8
-"""Weights of the matter of nodes as fog, and near walls, so that there is none where no picture asks for it."""
+EMPTY = 6.0e-8
+"""Weight of the light that nodes take as fog, so that there is none where no picture asks for it."""
 SLACK, VOTES, CONTRAST = 2, 2, 0.06
 """Silhouettes are widened by so many pixels; a node that so many see beside one is carved; what differs so much from
 the backdrop stands before it."""
@@ -120,8 +120,8 @@ def train_field(
         error = ((torch.minimum(seen, 1.0 + 0.01 * (seen - 1.0)) - target[ray]) ** 2).mean()  # cut at white
         for optimiser in (walls.optimiser, exposures):
             optimiser.zero_grad()
-        more = walls.roughness(EIKONAL if step >= switch else 0.0)
-        (error + more + (EMPTY if step < switch else THIN) * walls.matter(beta)).backward()
+        more = walls.roughness(EIKONAL) if step >= switch else walls.roughness(0.0) + EMPTY * walls.matter()
+        (error + more).backward()
         for optimiser in (walls.optimiser, exposures):
             optimiser.step()
         if progress is not None:
@@ -244,10 +244,10 @@ class Walls:
         s = np.where((np.abs(s) < 1.5 * zoom) & (np.abs(far) < 2.5), np.sign(far) * np.abs(s), far)
         return Walls(s, _zoomed(c, zoom) if zoom != 1.0 else c)
 
-    def matter(self, beta: float) -> torch.Tensor:
+    def matter(self) -> torch.Tensor:
         """Return the sum of the light that nodes take within a voxel."""
-        half = 0.5 * torch.exp(-self.s[2:].abs() / beta)
-        return (1.0 - torch.exp(-torch.where(self.s[2:] > 0.0, half, 1.0 - half) / beta)).sum()
+        half = 0.5 * torch.exp(-self.s[2:].abs() / WIDEST)
+        return (1.0 - torch.exp(-torch.where(self.s[2:] > 0.0, half, 1.0 - half) / WIDEST)).sum()
 
     def roughness(self, eikonal: float) -> torch.Tensor:
         """Return what a step lowers beside the error: no distance, curved, colours that change from node to node."""
