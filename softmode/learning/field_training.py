@@ -28,8 +28,8 @@ with needs_extra("rl", "training a field needs torch"):
 Array = NDArray[np.float64]
 
 COARSE, FINE, SWITCH, FIRST = 48, 96, 0.3, 200
-"""Nodes of an edge at first and at last; the part of the steps after which the grid is refined, at once if that were
-less than so many: fog needs them to become dense, and walls then begin as the hull."""
+"""Nodes of an edge at first and at last; the part of the steps after which the grid is refined, and how many that are
+at least if the coarse grid begins as fog, which needs them to become dense: of fewer steps it begins as the hull."""
 RAYS, REGULAR = 4096, 6000
 """Rays of a step on the fine grid, half as many on the coarse one; nodes with neighbours of a step."""
 WIDEST, SHARPEST = 1.0, 0.4
@@ -88,8 +88,9 @@ def train_field(
     carved = _hull(pictures, images, wall, middle, half)
     if not carved.any():
         raise AssetError("the silhouettes have nothing in common", hint="check poses, lens and that the wall is plain")
-    switch = int(SWITCH * steps) if SWITCH * steps >= FIRST else 0
-    walls, fresh = Walls(_distance(carved), np.zeros((*carved.shape, 3)), fog=switch > 0), 0
+    switch, fresh = int(SWITCH * steps), 0
+    foggy = switch >= FIRST
+    walls = Walls(_distance(carved), np.zeros((*carved.shape, 3)), fog=foggy)
     gain = torch.tensor(np.log(wall.mean(axis=1)), dtype=torch.float32, requires_grad=True)
     exposures = torch.optim.Adam([gain], lr=RATES[2])
     eyes = torch.tensor(np.array([p.camera.position for p in pictures]) - middle + half, dtype=torch.float32)
@@ -99,20 +100,21 @@ def train_field(
     hit = (last > first).nonzero()[:, 0]
     for step in range(steps):
         size = FINE if step >= switch else COARSE
-        if step and step == switch:
-            voxel = 2.0 * half / (walls.n - 1)
+        if foggy and step == switch:
+            foggy, voxel = False, 2.0 * half / (walls.n - 1)
             parts = hit.split(torch.bincount(hit // each, minlength=len(images)).tolist())
             lit = [
                 walls.lit(eye / voxel, ways[ray], first[ray] / voxel, last[ray] / voxel)
                 for eye, ray in zip(eyes, parts, strict=True)
             ]
             walls, fresh = walls.anew(size, torch.stack(lit).sum(0).numpy() > 1), step
-        elif size != walls.n or (step - fresh >= AGAIN and switch < step < 0.9 * steps):
+        elif size != walls.n or (step - fresh >= AGAIN and not foggy and step < 0.9 * steps):
             walls, fresh = walls.anew(size), step
-        beta = WIDEST * (SHARPEST / WIDEST) ** np.clip((step - switch) / (0.7 * (steps - switch)), 0.0, 1.0)
+        part = (step - switch) / (steps - switch) if step >= switch else step / switch
+        beta = WIDEST if foggy else WIDEST * (SHARPEST / WIDEST) ** min(part / 0.7, 1.0)
         for group, rate in zip(walls.optimiser.param_groups, RATES, strict=False):
             group["lr"] = rate * 0.1 ** ((step / steps) ** 2)
-        ray = hit[torch.randint(len(hit), (RAYS if step >= switch else RAYS // 2,))]
+        ray = hit[torch.randint(len(hit), (RAYS // 2 if foggy else RAYS,))]
         voxel, of = 2.0 * half / (walls.n - 1), ray // each
         near, far = first[ray] / voxel, last[ray] / voxel
         color, left = walls.march(eyes[of] / voxel, ways[ray], near, far, min(0.7, 1.2 * beta), beta)
@@ -120,7 +122,7 @@ def train_field(
         error = ((torch.minimum(seen, 1.0 + 0.01 * (seen - 1.0)) - target[ray]) ** 2).mean()  # cut at white
         for optimiser in (walls.optimiser, exposures):
             optimiser.zero_grad()
-        more = walls.roughness(EIKONAL) if step >= switch else walls.roughness(0.0) + EMPTY * walls.matter()
+        more = walls.roughness(0.0) + EMPTY * walls.matter() if foggy else walls.roughness(EIKONAL)
         (error + more).backward()
         for optimiser in (walls.optimiser, exposures):
             optimiser.step()
