@@ -23,6 +23,7 @@ import warp as wp
 from scipy.spatial import KDTree
 
 from benchmarks.record import add_record_option, record
+from softmode.errors import AssetError
 from softmode.mpm import (
     MORPH_MATERIAL,
     MassLoss,
@@ -114,7 +115,10 @@ def main() -> None:
 
 def paper_bodies(folder: Path, spacing: float) -> dict[str, ParticleBody]:
     """Return the paper's meshes filled as it fills them, by name."""
-    meshes = {name: trimesh.load_mesh(folder / f"paper_{file}.obj") for name, (file, _) in MESHES.items()}
+    files = {name: folder / f"paper_{file}.obj" for name, (file, _) in MESHES.items()}
+    if missing := [file.name for file in files.values() if not file.is_file()]:
+        raise AssetError(f"{folder}: no {', '.join(missing)}", hint="take them from Chayoso/Shape-morphing-binder")
+    meshes = {name: trimesh.load_mesh(file) for name, file in files.items()}
     return {
         name: particles_from_mesh(m.vertices, m.faces, spacing=spacing, material=MORPH_MATERIAL, exact=False)
         for name, m in meshes.items()

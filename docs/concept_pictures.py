@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import newton
 import numpy as np
@@ -20,11 +20,13 @@ from softmode.deformables.body.rkpm import make_basis
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body
 from softmode.deformables.quadrature.quadrature import quadrature_from_splats
+from softmode.deformables.quadrature.quadrature_density import Sampling, quadrature_from_density
 from softmode.deformables.quadrature.quadrature_grid import Quadrature
 from softmode.deformables.reduction.build_body import build_body
 from softmode.deformables.reduction.options import BuildOptions
 from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
 from softmode.objects import SoftObject
+from softmode.radiance import RadianceGrid
 from softmode.scenes import BoundSplats
 from softmode.splats import Splats, make_plush
 from softmode.splats.raster.pinhole import PinholeCamera
@@ -265,6 +267,27 @@ def camera_picture(folder: Path, painter: Painter, body: ReducedBody) -> None:
     save(picture, folder, "camera")
 
 
+def sampling_picture(folder: Path, plush: Splats) -> None:
+    """Draw slices of a field's density and of the points that fill it, on a grid and in Poisson disks."""
+    field = RadianceGrid.from_splats(plush, resolution=64)
+    low, high = field.bounds
+    picture, (axes,) = figure(3)
+    x, z = np.meshgrid(*(np.linspace(low[d], high[d], 200) for d in (0, 2)))
+    places = np.stack([x, np.full_like(x, 0.5 * (low + high)[1]), z], axis=-1).reshape(-1, 3)
+    shown = -np.expm1(-2.0 * field.spacing * field.densities(places)).reshape(x.shape)
+    axes[0].imshow(shown, origin="lower", extent=(low[0], high[0], low[2], high[2]), cmap="magma")
+    axes[0].set_title("occupancy 1 - exp(-sigma r)", fontsize=10)
+    for axis, sampling in zip(axes[1:], get_args(Sampling), strict=True):
+        found = quadrature_from_density(field.densities, field.surroundings, sampling=sampling)
+        middle = np.abs(found.points[:, 1] - 0.5 * (low + high)[1]) < 0.7 * found.spacing
+        size = 16.0 * found.weights[middle] / found.weights.mean()
+        axis.scatter(found.points[middle, 0], found.points[middle, 2], s=size, c=size, cmap="viridis", lw=0.0)
+        axis.set_title(f"{sampling}: {len(found.points)} points, area as volume", fontsize=10)
+    for axis in axes:
+        axis.set(xlim=(low[0], high[0]), ylim=(low[2], high[2]), aspect="equal")
+    save(picture, folder, "sampling")
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Write all pictures."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -287,6 +310,7 @@ def main(arguments: list[str] | None = None) -> None:
     handle_picture(folder, painter(), body)
     step_picture(folder, painter(), body)
     camera_picture(folder, painter(), body)
+    sampling_picture(folder, plush)
 
 
 if __name__ == "__main__":

@@ -48,8 +48,8 @@ class Morph:
     """Leave a target when so much of the loss is gone, 0..1."""
     particles: int = 10_000
     """About how many particles."""
-    shown: Annotated[Literal["splats", "particles"], _as()] = "splats"
-    """What film, recording and stage show."""
+    shown: Annotated[Literal["splats", "particles", "mesh"], _as()] = "splats"
+    """What film, recording and stage show; with mesh the stage has their surface, the others particles."""
     width: int = 640
     """Width of the film [px]."""
     device: str | None = None
@@ -100,7 +100,7 @@ class Morph:
                 return 0
             from softmode.viz.morph_film import RATE, MorphScene, film_morph
 
-            scene = MorphScene(run, solids, bodies, options, as_particles=self.shown == "particles", device=device)
+            scene = MorphScene(run, solids, bodies, options, as_particles=self.shown != "splats", device=device)
 
             @contextlib.contextmanager
             def showing(doing: str) -> Iterator[None]:
@@ -127,6 +127,7 @@ class Morph:
 
                 with showing("writing the stage"):
                     frames = (splats for _, splats in scene.splat_frames())
-                    write_splat_animation(self.usd, frames, fps=RATE, name="morph", as_points=scene.as_particles)
+                    shown = "points" if self.shown == "particles" else self.shown
+                    write_splat_animation(self.usd, frames, fps=RATE, name="morph", shown=shown)
                 print(f"wrote {self.usd}; open it in any viewer of OpenUSD")
         return 0

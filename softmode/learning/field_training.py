@@ -2,7 +2,9 @@
 
 The field is a signed distance s [voxels] at the nodes of a sparse grid, of density Psi(-s / beta) / beta, where Psi is
 the distribution function of Laplace and beta shrinks (VolSDF, Yariv et al. 2021), so that it ends in walls and not in
-fog. It is carved out of the silhouettes first, which takes a backdrop that is known.
+fog. On a coarse grid it begins as one: thin fog fills the hull of the silhouettes, and becomes dense where pictures ask
+for it. Then what light reaches is empty, and what none reaches is inside. (A hull that begins full of matter keeps a
+lid on every cavity.) Silhouettes take a backdrop that is known.
 """
 
 from __future__ import annotations
@@ -25,18 +27,24 @@ with needs_extra("rl", "training a field needs torch"):
 
 Array = NDArray[np.float64]
 
-COARSE, FINE, SWITCH = 48, 96, 0.3
-"""Nodes of an edge at first and at last, and the part of the steps after which the grid is refined."""
+COARSE, FINE, SWITCH, FIRST = 48, 96, 0.3, 200
+"""Nodes of an edge at first and at last; the part of the steps after which the grid is refined, and how many that are
+at least if the coarse grid begins as fog, which needs them to become dense: of fewer steps it begins as the hull."""
 RAYS, REGULAR = 4096, 6000
-"""Rays and nodes with neighbours of a step."""
+"""Rays of a step on the fine grid, half as many on the coarse one; nodes with neighbours of a step."""
 WIDEST, SHARPEST = 1.0, 0.4
-"""beta at the beginning and the end of a grid [voxels]."""
+"""beta of the coarse grid, and at the end of the fine one [voxels]."""
+FOG, LIT = 3.0, 0.5
+"""What nodes of the hull begin with [voxels]: a fortieth of the light is lost in a voxel; a node is lit where so much
+of the light of two pictures comes to it."""
 RATES = (0.1, 0.03, 3.0e-3)
 """Steps of distances [voxels], colours, and logarithms of exposures."""
 EIKONAL, SMOOTH, EVEN = 1.0e-2, 1.0e-3, 1.0e-3
-"""Weights of (|grad s| - 1)^2, of the curvature of s and of the differences of colours."""
+"""Weights of (|grad s| - 1)^2, on the fine grid, of the curvature of s and of the differences of colours."""
 BAND, AGAIN = 4.0, 150
 """Distance from the surface up to which nodes are learned [voxels], and steps after which it is found anew."""
+EMPTY = 6.0e-8
+"""Weight of the light that nodes take as fog, so that there is none where no picture asks for it."""
 SLACK, VOTES, CONTRAST = 2, 2, 0.06
 """Silhouettes are widened by so many pixels; a node that so many see beside one is carved; what differs so much from
 the backdrop stands before it."""
@@ -53,7 +61,7 @@ def train_field(
     """Train a field on pictures of an object before a white wall.
 
     The exposure of each picture is found too. Colours do not depend on the direction. What no picture shows is filled.
-    A cavity into which few pictures look, such as the inside of a cup, is not told from a lid, and is full.
+    A cavity is empty as far as two pictures look into it.
 
     Args:
         pictures: The pictures; the border of each is the wall. The object is where their axes meet.
@@ -80,7 +88,9 @@ def train_field(
     carved = _hull(pictures, images, wall, middle, half)
     if not carved.any():
         raise AssetError("the silhouettes have nothing in common", hint="check poses, lens and that the wall is plain")
-    walls = Walls(_distance(carved), np.zeros((*carved.shape, 3)), inside=True)
+    switch, fresh = int(SWITCH * steps), 0
+    foggy = switch >= FIRST
+    walls = Walls(_distance(carved), np.zeros((*carved.shape, 3)), fog=foggy)
     gain = torch.tensor(np.log(wall.mean(axis=1)), dtype=torch.float32, requires_grad=True)
     exposures = torch.optim.Adam([gain], lr=RATES[2])
     eyes = torch.tensor(np.array([p.camera.position for p in pictures]) - middle + half, dtype=torch.float32)
@@ -88,16 +98,23 @@ def train_field(
     target, each = torch.tensor(images.reshape(-1, 3)), images[0, ..., 0].size
     first, last = _reach(walls, eyes.repeat_interleave(each, 0), ways, 2.0 * half)
     hit = (last > first).nonzero()[:, 0]
-    switch, fresh = int(SWITCH * steps), 0
     for step in range(steps):
         size = FINE if step >= switch else COARSE
-        if size != walls.n or (step - fresh >= AGAIN and step < 0.9 * steps):
+        if foggy and step == switch:
+            foggy, voxel = False, 2.0 * half / (walls.n - 1)
+            parts = hit.split(torch.bincount(hit // each, minlength=len(images)).tolist())
+            lit = [
+                walls.lit(eye / voxel, ways[ray], first[ray] / voxel, last[ray] / voxel)
+                for eye, ray in zip(eyes, parts, strict=True)
+            ]
+            walls, fresh = walls.anew(size, torch.stack(lit).sum(0).numpy() > 1), step
+        elif size != walls.n or (step - fresh >= AGAIN and not foggy and step < 0.9 * steps):
             walls, fresh = walls.anew(size), step
         part = (step - switch) / (steps - switch) if step >= switch else step / switch
-        beta = WIDEST * (SHARPEST / WIDEST) ** min(part / 0.7, 1.0)
+        beta = WIDEST if foggy else WIDEST * (SHARPEST / WIDEST) ** min(part / 0.7, 1.0)
         for group, rate in zip(walls.optimiser.param_groups, RATES, strict=False):
             group["lr"] = rate * 0.1 ** ((step / steps) ** 2)
-        ray = hit[torch.randint(len(hit), (RAYS,))]
+        ray = hit[torch.randint(len(hit), (RAYS // 2 if foggy else RAYS,))]
         voxel, of = 2.0 * half / (walls.n - 1), ray // each
         near, far = first[ray] / voxel, last[ray] / voxel
         color, left = walls.march(eyes[of] / voxel, ways[ray], near, far, min(0.7, 1.2 * beta), beta)
@@ -105,7 +122,8 @@ def train_field(
         error = ((torch.minimum(seen, 1.0 + 0.01 * (seen - 1.0)) - target[ray]) ** 2).mean()  # cut at white
         for optimiser in (walls.optimiser, exposures):
             optimiser.zero_grad()
-        (error + walls.roughness()).backward()
+        more = walls.roughness(0.0) + EMPTY * walls.matter() if foggy else walls.roughness(EIKONAL)
+        (error + more).backward()
         for optimiser in (walls.optimiser, exposures):
             optimiser.step()
         if progress is not None:
@@ -182,13 +200,14 @@ def _reach(walls: Walls, eye: torch.Tensor, way: torch.Tensor, edge: float) -> t
 class Walls:
     """Signed distances [voxels] and colours at the nodes of a cube near a surface; the others are out (0) or in (1)."""
 
-    def __init__(self, distance: np.ndarray, shades: np.ndarray, *, inside: bool) -> None:
-        """Take dense arrays (n, n, n) and (n, n, n, 3); learn `inside` of the surface too, or only near it."""
-        n, near = len(distance), distance < BAND if inside else np.abs(distance) < BAND
+    def __init__(self, distance: np.ndarray, shades: np.ndarray, *, fog: bool = False) -> None:
+        """Take dense arrays (n, n, n) and (n, n, n, 3), learned near the surface; or fill it with fog."""
+        n, near = len(distance), distance < 2.0 if fog else np.abs(distance) < BAND
         kept = np.flatnonzero(near)
         rows = np.where(distance.ravel() > 0.0, 0, 1)
         rows[kept] = np.arange(2, len(kept) + 2)
-        table = np.column_stack([distance.ravel(), shades.reshape(-1, 3)])[kept]
+        start = FOG + np.maximum(distance, 0.0) if fog else distance
+        table = np.column_stack([start.ravel(), shades.reshape(-1, 3)])[kept]
         table = np.concatenate([[[30.0, 0.0, 0.0, 0.0], [-30.0, 0.0, 0.0, 0.0]], table])
         self.n, self.near, self.rows = n, near, torch.tensor(rows)
         self.s = torch.tensor(table[:, :1], dtype=torch.float32, requires_grad=True)
@@ -205,10 +224,18 @@ class Walls:
         nearest: Any = ndimage.distance_transform_edt(~self.near, return_distances=False, return_indices=True)
         return s[..., 0], c[tuple(nearest)]
 
-    def anew(self, n: int) -> Walls:
-        """Return them with true distances from the surface of the largest part, perhaps on a finer grid."""
+    def anew(self, n: int, lit: np.ndarray | None = None) -> Walls:
+        """Return them with true distances from the surface of the largest part, perhaps on a finer grid.
+
+        What was fog is full where it is dense, not `lit` (n^3,), or enclosed but for holes of a node.
+        """
         s, c = self.dense()
         zoom = n / self.n
+        if lit is not None:
+            within: Any = ndimage.binary_erosion(self.near, iterations=2)
+            solid: Any = (s < 0.0) | (within & ~lit.reshape(s.shape))
+            whole: Any = ndimage.binary_fill_holes(ndimage.binary_closing(solid))
+            s = np.where(solid | ndimage.binary_erosion(whole), -np.abs(s), np.abs(s))
         s = _zoomed(np.clip(s, -3.0, 3.0), zoom) * zoom
         found: Any = ndimage.label(s < 0.0)
         parts, count = found
@@ -217,45 +244,66 @@ class Walls:
         full = parts == 1 + np.argmax(np.bincount(parts.ravel())[1:])
         far = _distance(full)
         s = np.where((np.abs(s) < 1.5 * zoom) & (np.abs(far) < 2.5), np.sign(far) * np.abs(s), far)
-        return Walls(s, _zoomed(c, zoom) if zoom != 1.0 else c, inside=n == COARSE)
+        return Walls(s, _zoomed(c, zoom) if zoom != 1.0 else c)
 
-    def roughness(self) -> torch.Tensor:
+    def matter(self) -> torch.Tensor:
+        """Return the sum of the light that nodes take within a voxel."""
+        half = 0.5 * torch.exp(-self.s[2:].abs() / WIDEST)
+        return (1.0 - torch.exp(-torch.where(self.s[2:] > 0.0, half, 1.0 - half) / WIDEST)).sum()
+
+    def roughness(self, eikonal: float) -> torch.Tensor:
         """Return what a step lowers beside the error: no distance, curved, colours that change from node to node."""
         rows = self.around[torch.randint(len(self.around), (REGULAR,))]
         s, c = self.s[:, 0][rows], self.c[rows[:, :4]]
         slope = 0.5 * (s[:, 2::2] - s[:, 1::2]).norm(dim=1)
         curve = s[:, 1:].sum(1) - 6.0 * s[:, 0]
         change = ((c[:, :1] - c[:, 1:]) ** 2).sum(-1)
-        return EIKONAL * ((slope - 1.0) ** 2).mean() + SMOOTH * (curve**2).mean() + EVEN * change.mean()
+        return eikonal * ((slope - 1.0) ** 2).mean() + SMOOTH * (curve**2).mean() + EVEN * change.mean()
 
-    def march(
-        self, eye: torch.Tensor, way: torch.Tensor, first: torch.Tensor, last: torch.Tensor, step: float, beta: float
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return colour times coverage (R, 3) and light left (R,) of rays [voxels] between two places each."""
-        ticks = torch.arange(float(((last - first) / step).max()))[None] + torch.rand(len(eye), 1)
+    def _samples(
+        self, eye: torch.Tensor, way: torch.Tensor, first: torch.Tensor, last: torch.Tensor, step: float
+    ) -> tuple[torch.Size, torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return the shape (R, S) of samples, which of them lie in cells, and the rows and weights of their nodes."""
+        ticks = torch.arange(float(((last - first) / step).max()))[None] + torch.rand(len(way), 1)
         t = first[:, None] + ticks * step
-        at = eye[:, None] + t[..., None] * way[:, None]
+        at = eye[..., None, :] + t[..., None] * way[:, None]
         corner = at.floor().long().clamp(0, self.n - 2)
         flat = (corner[..., 0] * self.n + corner[..., 1]) * self.n + corner[..., 2]
         use = (self.cells[flat] & (t < last[:, None])).reshape(-1).nonzero()[:, 0]
         f = (at - corner).reshape(-1, 3)[use].clamp(0.0, 1.0)
         bits = torch.tensor(list(np.ndindex(2, 2, 2)))
         rows = self.rows[flat.reshape(-1)[use][:, None] + bits @ torch.tensor([self.n**2, self.n, 1])]
-        weight = torch.where(bits > 0, f[:, None], 1.0 - f[:, None]).prod(-1)
+        return t.shape, use, rows, torch.where(bits > 0, f[:, None], 1.0 - f[:, None]).prod(-1)
 
-        def depths(rows: torch.Tensor, weight: torch.Tensor, use: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-            s = (self.s.index_select(0, rows.reshape(-1)).reshape(-1, 8) * weight).sum(1)
-            half = 0.5 * torch.exp(-s.abs() / beta)
-            tau = torch.where(s > 0.0, half, 1.0 - half) * (step / beta)
-            full = torch.zeros(t.numel()).index_put((use,), tau).reshape(t.shape)
-            return full, torch.exp(full - full.cumsum(1))
+    def _depths(
+        self, shape: torch.Size, use: torch.Tensor, rows: torch.Tensor, weight: torch.Tensor, step: float, beta: float
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return optical depths of samples (R, S), and the light that comes to each."""
+        s = (self.s.index_select(0, rows.reshape(-1)).reshape(-1, 8) * weight).sum(1)
+        half = 0.5 * torch.exp(-s.abs() / beta)
+        tau = torch.where(s > 0.0, half, 1.0 - half) * (step / beta)
+        full = torch.zeros(shape.numel()).index_put((use,), tau).reshape(shape)
+        return full, torch.exp(full - full.cumsum(1))
 
+    @torch.no_grad()
+    def lit(self, eye: torch.Tensor, way: torch.Tensor, first: torch.Tensor, last: torch.Tensor) -> torch.Tensor:
+        """Return which nodes (n^3,) light of rays comes to."""
+        shape, use, rows, weight = self._samples(eye, way, first, last, 0.7)
+        light = self._depths(shape, use, rows, weight, 0.7, SHARPEST)[1].reshape(-1)[use]
+        found = torch.zeros(len(self.s)).scatter_reduce(0, rows.gather(1, weight.argmax(1, True))[:, 0], light, "amax")
+        return found[self.rows] > LIT
+
+    def march(
+        self, eye: torch.Tensor, way: torch.Tensor, first: torch.Tensor, last: torch.Tensor, step: float, beta: float
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return colour times coverage (R, 3) and light left (R,) of rays [voxels] between two places each."""
+        shape, use, rows, weight = self._samples(eye, way, first, last, step)
         with torch.no_grad():
-            tau, light = (x.reshape(-1)[use] for x in depths(rows, weight, use))
+            tau, light = (x.reshape(-1)[use] for x in self._depths(shape, use, rows, weight, step, beta))
             seen = (tau > 1e-4) & (light > 1e-3)
         rows, weight, use = rows[seen], weight[seen], use[seen]
-        tau, light = depths(rows, weight, use)
+        tau, light = self._depths(shape, use, rows, weight, step, beta)
         share = (light * (1.0 - torch.exp(-tau))).reshape(-1)[use]
         color = 0.5 + SH_DC * (self.c.index_select(0, rows.reshape(-1)).reshape(-1, 8, 3) * weight[..., None]).sum(1)
-        color = torch.zeros(len(eye), 3).index_add(0, use // t.shape[1], share[:, None] * color)
+        color = torch.zeros(len(way), 3).index_add(0, use // shape[1], share[:, None] * color)
         return color, torch.exp(-tau.sum(1))

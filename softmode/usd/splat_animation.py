@@ -5,10 +5,16 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Iterable
+from typing import Any, Literal, get_args
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+from scipy.spatial import KDTree
 
+from softmode.checks import require_choice
 from softmode.errors import ConfigError
+from softmode.objects.shapes.level_sets import marching_cubes
 from softmode.splats.formats.usd import define_splats, set_splat_column, splat_columns
 from softmode.splats.splats import Splats
 from softmode.usd.openusd import check_stage, openusd, whole_stage
@@ -25,7 +31,7 @@ def write_splat_animation(
     *,
     fps: float = 30.0,
     name: str = "splats",
-    as_points: bool = False,
+    shown: Literal["splats", "points", "mesh"] = "splats",
 ) -> int:
     """Write splats that move, change and take other colours as a stage; it appears complete or not at all.
 
@@ -34,16 +40,20 @@ def write_splat_animation(
         frames: The splats of each frame, as many in all of them [m].
         fps: Frames per second [1/s]; a frame is a time code.
         name: Name of the prim under /World.
-        as_points: Write `UsdGeom.Points` with colours and the widths of the first frame, which every viewer draws.
+        shown: What is written: the splats; `UsdGeom.Points` with colours and the widths of the first frame, which every
+            viewer draws; or a `UsdGeom.Mesh`, the surface of a body that the splats fill evenly, by marching cubes
+            over half as wide cells as they are apart in the first frame, each vertex in the colour of the nearest.
 
     Returns:
         The number of frames.
 
     Raises:
-        ConfigError: If there is no frame, the number of splats changes, or the file's name does not end like a stage.
+        ConfigError: If there is no frame, the number of splats changes, the file's name does not end like a stage, or
+            `shown` is no choice.
         StorageError: If the file cannot be written.
         MissingExtraError: If the extra `[usd]` is not installed.
     """
+    require_choice("shown", shown, get_args(Literal["splats", "points", "mesh"]))
     target = check_stage(path)
     UsdGeom, UsdVol = openusd("UsdGeom", "UsdVol")
     with contextlib.suppress(OSError):  # what is in the way will be told by the next line
@@ -54,12 +64,15 @@ def write_splat_animation(
         stage.SetTimeCodesPerSecond(fps)
         stage.SetFramesPerSecond(fps)
         stage.SetStartTimeCode(0.0)
-        prim, count, first, near, waiting = f"/World/{prim_name(name, set())}", 0, None, None, 0
+        prim, count, first, near, waiting, cell = f"/World/{prim_name(name, set())}", 0, None, None, 0, 0.0
         low, high = np.full(3, np.inf), np.full(3, -np.inf)
         for splats in frames:
             if first is None:
                 first = splats
-                if as_points:
+                if shown == "mesh":
+                    UsdGeom.Mesh.Define(stage, prim).CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+                    cell = 0.5 * float(np.median(KDTree(splats.means).query(splats.means, k=2)[0][:, 1]))
+                elif shown == "points":
                     points = UsdGeom.Points.Define(stage, prim)
                     points.SetWidthsInterpolation(UsdGeom.Tokens.vertex)
                     points.CreateWidthsAttr(float_array(2.0 * splats.scales[:, 0]))
@@ -67,7 +80,9 @@ def write_splat_animation(
                     define_splats(stage, prim, splats.sh_degree)
             if splats.count != first.count:
                 raise ConfigError(f"frames: frame {count} has {splats.count} splats, the first one {first.count}")
-            if as_points:
+            if shown == "mesh":
+                waiting += _set_surface(UsdGeom.Mesh(stage.GetPrimAtPath(prim)), splats, cell, count)
+            elif shown == "points":
                 points = UsdGeom.Points(stage.GetPrimAtPath(prim))
                 points.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(vectors(splats.colors()), count)
                 set_points(points, splats.means, count)
@@ -93,3 +108,22 @@ def write_splat_animation(
         author_lights(stage)
         save(layer)
     return count
+
+
+def _set_surface(mesh: Any, splats: Splats, cell: float, time: int) -> int:
+    """Author the surface of what splats fill, two cells apart from each other, at a time code; return its bytes."""
+    UsdGeom, Vt = openusd("UsdGeom", "Vt")
+    low = splats.means.min(axis=0) - 5.0 * cell
+    node: NDArray[np.int64] = np.floor((splats.means - low) / cell).astype(np.int64)
+    shape = node.max(axis=0) + 6
+    full = np.bincount(np.ravel_multi_index(tuple(node.T), shape), minlength=int(np.prod(shape))).reshape(shape)
+    found, faces = marching_cubes(0.5 / 8.0 - gaussian_filter(full.astype(np.float64), 1.5))
+    points = low + cell * (found + 0.5)
+    colors = splats.colors()[KDTree(splats.means).query(points)[1]]
+    places = vectors(points)
+    mesh.CreatePointsAttr().Set(places, time)
+    mesh.CreateExtentAttr().Set(UsdGeom.PointBased.ComputeExtent(places), time)
+    mesh.CreateFaceVertexCountsAttr().Set(Vt.IntArray.FromNumpy(np.full(len(faces), 3, np.int32)), time)
+    mesh.CreateFaceVertexIndicesAttr().Set(Vt.IntArray.FromNumpy(faces.astype(np.int32).ravel()), time)
+    mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(vectors(colors), time)
+    return 24 * len(points) + 16 * len(faces)

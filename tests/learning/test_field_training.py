@@ -12,7 +12,7 @@ from softmode.errors import AssetError
 from softmode.radiance import RadianceGrid, render_radiance
 from softmode.splats import Lens, PinholeCamera, read_transforms, write_transforms
 
-pytest.importorskip("torch")
+torch = pytest.importorskip("torch")
 RADIUS, EDGE = 0.05, 40
 
 
@@ -56,6 +56,31 @@ def test_a_ball_is_a_ball(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     assert solid.report["fog"] < 0.2 and found.metres == 1.0
     top, bottom = found.colors([[0.0, 0.0, RADIUS], [0.0, 0.0, -RADIUS]], [[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
     assert top[0] > top[2] and bottom[2] > bottom[0]
+
+
+def test_what_light_reaches_is_empty() -> None:
+    """Fog is empty where light of two pictures comes to it, and full in what is closed: a cup is open, a shell full."""
+    from softmode.learning.field_training import Walls
+
+    n = 32
+    x, y, z = np.meshgrid(*(np.arange(n) - 15.5,) * 3, indexing="ij")
+    ring, shell = np.hypot(x, y), np.sqrt(x * x + y * y + z * z)
+    cup = (ring < 11.0) & (np.abs(z) < 9.0) & ~((ring < 8.0) & (z > -6.0))
+    line = torch.linspace(0.0, n - 1.0, 64)
+    places = torch.stack(torch.meshgrid(line, line, indexing="ij"), dim=-1).reshape(-1, 2)
+    for dense, inside in ((cup, False), ((shell < 11.0) & (shell > 8.0), True)):
+        hull = (ring < 11.0) & (np.abs(z) < 9.0) if not inside else shell < 11.0
+        walls = Walls(np.where(hull, -1.0, 5.0), np.zeros((n, n, n, 3)), fog=True)
+        with torch.no_grad():
+            walls.s[2:, 0] = torch.tensor(np.where(dense, -1.0, 3.0)[walls.near])
+        lit = torch.zeros(n**3)
+        for tilt in (0.0, 0.1):
+            eye = torch.cat([places, torch.full((len(places), 1), 60.0)], dim=1)
+            way = torch.tensor([tilt, 0.0, -1.0]).expand(len(places), 3)
+            lit += walls.lit(eye, way, torch.full((len(eye),), 25.0), torch.full((len(eye),), 65.0))
+        s = walls.anew(n, lit.numpy() > 1).dense()[0]
+        assert (s[16, 16, 12] < 0.0) == inside and s[16, 16, 30] > 0.0
+        assert (s < 0.0).sum() == pytest.approx((hull if inside else dense).sum(), rel=0.1)
 
 
 def test_silhouettes_without_anything_in_common(tmp_path: Path) -> None:

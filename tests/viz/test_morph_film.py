@@ -7,7 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 import warp as wp
+from scipy.spatial import KDTree
 
 from softmode.cli.main import main
 from softmode.errors import ConfigError
@@ -88,13 +90,13 @@ def test_a_recording_holds_splats_particles_and_the_loss(scenes: list[MorphScene
 
 
 def test_a_stage_holds_every_frame(scenes: list[MorphScene], tmp_path: Path) -> None:
-    """Positions, scales and colours of splats, or points with widths and colours, are sampled at whole time codes."""
+    """Splats, points, or a closed mesh of the particles' volume in their colours, are sampled at whole time codes."""
     pytest.importorskip("pxr", reason="the extra usd is not installed")
     Usd, UsdGeom = openusd("Usd", "UsdGeom")
     for scene, points in zip(scenes, (False, True), strict=True):
         file = tmp_path / "stage" / f"morph_{points}.usdc"
         frames = [splats for _, splats in scene.splat_frames(stride=5)]
-        assert write_splat_animation(file, frames, name="morph", as_points=points) == 5
+        assert write_splat_animation(file, frames, name="morph", shown="points" if points else "splats") == 5
         stage = Usd.Stage.Open(str(file))
         prim = stage.GetPrimAtPath("/World/morph")
         assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (0.0, 4.0)
@@ -110,6 +112,17 @@ def test_a_stage_holds_every_frame(scenes: list[MorphScene], tmp_path: Path) -> 
             assert np.allclose(prim.GetAttribute("scales").Get(4), frames[4].scales)
             sh = np.array(prim.GetAttribute("radiance:sphericalHarmonicsCoefficients").Get(4))
             assert np.allclose(sh, frames[4].sh[:, 0], atol=1e-6)
+    file = tmp_path / "mesh.usdc"
+    write_splat_animation(file, frames, name="morph", shown="mesh")
+    stage = Usd.Stage.Open(str(file))
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/World/morph"))
+    for code in (0, 4):
+        x, faces = (np.array(a.Get(code)) for a in (mesh.GetPointsAttr(), mesh.GetFaceVertexIndicesAttr()))
+        made = trimesh.Trimesh(x, faces.reshape(-1, 3))
+        assert made.is_watertight and len(mesh.GetFaceVertexCountsAttr().Get(code)) == len(made.faces)
+        assert made.volume == pytest.approx(scene._bodies[0].mass / scene._bodies[0].material.density, rel=0.15)
+        near = KDTree(frames[code].means).query(x)[1]
+        assert np.allclose(mesh.GetDisplayColorAttr().Get(code), frames[code].colors()[near], atol=1e-6)
     with pytest.raises(ConfigError, match="one or more"):
         write_splat_animation(tmp_path / "none.usdc", [])
     with pytest.raises(ConfigError, match="frame 1 has 3 splats"):

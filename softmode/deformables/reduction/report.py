@@ -535,6 +535,14 @@ def _check_asset(body: ReducedBody, told: dict[str, float], notes: _Notes) -> No
             what + (lid if opened > VOID_SHARE else ""),
             "if the object is hollow, build from a mesh of it; train with pictures that look into it",
         )
+    elif body.provenance.get("quadrature_source") == "density":
+        notes.find(
+            "note",
+            "inside",
+            f"pictures show no inside: that all {1.0e6 * body.volume:.3g} cm^3 of the solid are full is assumed,"
+            " and a cavity that few pictures look into may be closed by a lid",
+            "if it is hollow, train with pictures that look into it, or build from a mesh of it",
+        )
     told_splats = told.get("quadrature_asset_splats", 0.0)
     given = told.get("asset_splats", told_splats)
     left_out = told.get("asset_left_out", told_splats - told.get("quadrature_part_splats", told_splats))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from importlib.util import find_spec
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -151,6 +151,23 @@ def level_mesh(level: Level, low: ArrayLike, high: ArrayLike, cell: float) -> tr
         cell: Edge of the cells [m]; much less than the thinnest part.
     """
     import trimesh
+
+    start = np.asarray(low, np.float64) - COARSE * cell
+    shape = tuple(np.ceil((np.asarray(high) - start) / (COARSE * cell)).astype(int) + 2)
+    coarse = level(start + COARSE * cell * np.argwhere(np.ones(shape, bool))).reshape(shape)
+    field = np.asarray(zoom(coarse, [(COARSE * (n - 1) + 1) / n for n in shape], order=1))
+    near = np.abs(field) < 2.0 * COARSE * cell
+    field[near] = level(start + cell * np.argwhere(near))
+    field[np.abs(field) < CLEARANCE * cell] = CLEARANCE * cell
+    found, faces = marching_cubes(field / cell)
+    points = start + cell * found
+    slope = level_slope(level, points, 0.05 * cell)
+    step = np.clip(-level(points) / np.maximum((slope**2).sum(axis=1), 0.25), -0.3 * cell, 0.3 * cell)
+    return trimesh.Trimesh(points + step[:, None] * slope, faces, process=False)
+
+
+def marching_cubes(field: Array) -> tuple[Array, NDArray[np.int32]]:
+    """Return vertices (V, 3), in nodes, and triangles (T, 3) of the surface of what is negative in a grid (Warp's)."""
     import warp as wp
 
     if find_spec("warp.geometry") is None:  # Warp 1.17 has no such module.
@@ -159,19 +176,9 @@ def level_mesh(level: Level, low: ArrayLike, high: ArrayLike, cell: float) -> tr
         from warp.geometry import IsoSurfaceMarchingCubes
 
         extract = IsoSurfaceMarchingCubes.extract
-    start = np.asarray(low, np.float64) - COARSE * cell
-    shape = tuple(np.ceil((np.asarray(high) - start) / (COARSE * cell)).astype(int) + 2)
-    coarse = level(start + COARSE * cell * np.argwhere(np.ones(shape, bool))).reshape(shape)
-    field = np.asarray(zoom(coarse, [(COARSE * (n - 1) + 1) / n for n in shape], order=1))
-    near = np.abs(field) < 2.0 * COARSE * cell
-    field[near] = level(start + cell * np.argwhere(near))
-    field[np.abs(field) < CLEARANCE * cell] = CLEARANCE * cell
-    field = wp.array(field / cell, dtype=wp.float32, device="cpu")
-    found, faces = extract(field)  # type: ignore[arg-type]  # of three dimensions
-    points = start + cell * found.numpy().astype(np.float64)
-    slope = level_slope(level, points, 0.05 * cell)
-    step = np.clip(-level(points) / np.maximum((slope**2).sum(axis=1), 0.25), -0.3 * cell, 0.3 * cell)
-    return trimesh.Trimesh(points + step[:, None] * slope, faces.numpy().reshape(-1, 3), process=False)
+    given: Any = wp.array(field, dtype=wp.float32, device="cpu")
+    found, faces = extract(given)
+    return found.numpy().astype(np.float64), faces.numpy().reshape(-1, 3)
 
 
 def level_slope(level: Level, points: Array, step: float) -> Array:
