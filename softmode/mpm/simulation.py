@@ -184,6 +184,8 @@ class MpmSimulation:
         self.yield_stress = self._array(self._padded(limits), self._real)
         """Yield stress [Pa], (W, N); 0 where particles are elastic."""
         self._plastic = any(body.yield_stress is not None for body in self.bodies)
+        self.coupled = False
+        """Whether a `SolverCoupledParticles` steps it."""
         self.volume = self._zeros(self._real, self.world_count, self.count)
         self.shapes = shapes
         self.impulse = self._zeros(
@@ -395,7 +397,15 @@ class MpmSimulation:
 
         Returns:
             Derivatives by the first state, and by what does not move.
+
+        Raises:
+            ConfigError: If a robot's solver steps it: the start of a step is overwritten by its end.
         """
+        if self.coupled:
+            raise ConfigError(
+                "backward: there are no derivatives across the steps of a robot's solver",
+                hint="simulate the particles alone, with shapes that move as given",
+            )
         states, parameters = self._gradients()
         for bar in (parameters.control, parameters.mu, parameters.lam, parameters.yield_stress):
             bar.zero_()

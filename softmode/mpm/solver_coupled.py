@@ -46,6 +46,7 @@ class SolverCoupledParticles(SolverBase):
             )
         super().__init__(solver.model)
         self.solver, self.particles = solver, particles
+        particles.coupled = True
         self.dt = particles.step_count * particles.options.dt
         """Duration of a step [s]."""
         self._start = [wp.clone(array) for array in particles.first.arrays]

@@ -113,7 +113,7 @@ def test_a_gripper_lifts_a_lump_and_its_wrist_feels_the_weight() -> None:
 
 
 def test_faults_of_a_step() -> None:
-    """Another duration, another model, one world alone; particles that leave the grid are counted."""
+    """Another duration, another model, derivatives; particles that leave the grid are counted."""
     scene = Scene(lambda world: add_free_box(world, (0.05,) * 3, 1.0, (0.0, 0.0, 0.1)), [], coupled=True, dt=0.001)
     options = MpmOptions(grid=Grid(shape=(24, 24, 24), spacing=CELL, origin=(-0.115, -0.115, 0.105)), dt=0.0005)
     body = lump((0.04,) * 3, (0.0, 0.0, 0.2))
@@ -122,6 +122,8 @@ def test_faults_of_a_step() -> None:
     s = beside(scene, body, options)
     with pytest.raises(ConfigError, match=r"2 steps of 0.0005 s.*step_count"):
         scene.solver.step(scene.state, scene.next_state, None, None, 0.004)
+    with pytest.raises(ConfigError, match="no derivatives across"):
+        s.backward()
     s.start(v=np.tile([200.0, 0.0, 0.0], (1, s.count, 1)))
     scene.step(3)
     with pytest.raises(SolverDiverged, match=rf"left the grid; {s.count} of {s.count} are outside.*room"):
