@@ -177,8 +177,8 @@ def marching_cubes(field: Array) -> tuple[Array, NDArray[np.int32]]:
 
         extract = IsoSurfaceMarchingCubes.extract
     given: Any = wp.array(field, dtype=wp.float32, device="cpu")
-    found, faces = extract(given)
-    return found.numpy().astype(np.float64), faces.numpy().reshape(-1, 3)
+    found, faces = (x.numpy() for x in extract(given))
+    return found.astype(np.float64), np.asarray(faces, dtype=np.int32).reshape(-1, 3)
 
 
 def level_slope(level: Level, points: Array, step: float) -> Array:
