@@ -1,11 +1,9 @@
 """Let 18 different soft toys fall through a plinko board, as in FreeForm's large scene, and film them.
 
-The fifteen presets of the library and three of other size and stiffness start over a board of staggered pegs between
-two panes (the front one is clear), bounce off the pegs and each other, and come to rest in the bins below. Captures of
-one's own take the places of the first. There is no robot.
+The fifteen presets and three of other size and stiffness start over staggered pegs between two panes (the front one is
+clear) and come to rest in the bins below. Captures of one's own take the places of the first. There is no robot.
 
-Run: ``python examples/plinko.py [--splat FILE ...] [--object FILE ...] [--video FILE] [--seed N] [--device cuda:0]
-[--short]``; both options may be given several times.
+Run: ``python examples/plinko.py [--splat FILE ...] [--object FILE ...] [--video FILE] [--seed N] [--short]``
 """
 
 import argparse
@@ -23,20 +21,15 @@ from softmode.scenes import Record, SplatScene
 from softmode.splats import CameraOptions, PinholeCamera, ShadowOptions
 from softmode.viz import Film
 
-WIDTH, TALL, GAP, PANE, PEG, BIN, WALL = 0.60, 0.56, 0.09, 0.02, 0.012, 0.14, 0.006
-"""Width and half height of the board, room in it, thickness of a pane, radius of a peg, height of the
-walls between the bins, half their thickness [m]."""
+WIDTH, TALL, GAP, PANE = 0.60, 0.56, 0.09, 0.02  # Of the board: width, half height, room in it, thickness [m].
+PEG, BIN, WALL = 0.012, 0.14, 0.006  # Radius of a peg, height of the walls between bins, half their thickness [m].
 WALLS, BETWEEN = (-0.15, 0.0, 0.15), (-0.225, -0.075, 0.075, 0.225)
-PEGS = np.array([(x, 0.32 + 0.12 * row) for row in range(4) for x in (WALLS if row % 2 else BETWEEN)])
-"""Centres (x, z) of the pegs [m], over the walls and between them."""
-SMALL = {"cable": 0.04, "doughnut": 0.06, "ball": 0.055, "block-a": 0.045, "block-b": 0.045, "block-c": 0.045}
-"""Longest edges of those that are thick, and of the cable, which may hook a peg [m]."""
+PEGS = np.array([(x, 0.32 + 0.12 * row) for row in range(4) for x in (WALLS if row % 2 else BETWEEN)])  # x, z [m].
+SMALL = {"cable": 0.04, "doughnut": 0.06, "ball": 0.055, "block-a": 0.045, "block-b": 0.045, "block-c": 0.045}  # [m].
 BUILD, SAMPLES, SIZE = BuildOptions(mode_count=5, cubature_count=192), 300, 0.065
 TOYS = [(name, SMALL.get(name, SIZE), 1.0) for name in PRESETS]
-TOYS += [("bear", 0.055, 4.0), ("doughnut", 0.05, 8.0), ("cushion", 0.055, 3.0)]
-"""Each toy, its longest edge [m], and how many times as stiff as its preset it is."""
-PLUSH = Material(youngs_modulus=5.0e4, poissons_ratio=0.35, density=150.0)
-"""What captures are made of."""
+TOYS += [("bear", 0.055, 4.0), ("doughnut", 0.05, 8.0), ("cushion", 0.055, 3.0)]  # Edge [m], stiffness over its own.
+PLUSH = Material(youngs_modulus=5.0e4, poissons_ratio=0.35, density=150.0)  # What captures are made of.
 
 
 def add_board(world: newton.ModelBuilder) -> None:
@@ -49,23 +42,20 @@ def add_board(world: newton.ModelBuilder) -> None:
     world.add_shape_box(-1, xform=below, hx=3.0, hy=3.0, hz=0.05, color=(0.70, 0.68, 0.64))
     world.add_shape_box(-1, xform=back, hx=0.5 * WIDTH + PANE, hy=pane, hz=TALL, color=(0.80, 0.83, 0.86))
     world.add_shape_box(-1, xform=front, hx=0.5 * WIDTH + PANE, hy=pane, hz=TALL, cfg=clear)
-    for x in (-0.5 * (WIDTH + PANE), 0.5 * (WIDTH + PANE)):
-        place = wp.transform((x, 0.0, TALL), upright)
-        world.add_shape_box(-1, xform=place, hx=pane, hy=0.5 * GAP, hz=TALL, color=wood)
-    for x in WALLS:
-        place = wp.transform((x, 0.0, 0.5 * BIN), upright)
-        world.add_shape_box(-1, xform=place, hx=WALL, hy=0.5 * GAP, hz=0.5 * BIN, color=wood)
+    sides = [(x, TALL, pane) for x in (-0.5 * (WIDTH + PANE), 0.5 * (WIDTH + PANE))]
+    for x, tall, thick in sides + [(x, 0.5 * BIN, WALL) for x in WALLS]:
+        place = wp.transform((x, 0.0, tall), upright)
+        world.add_shape_box(-1, xform=place, hx=thick, hy=0.5 * GAP, hz=tall, color=wood)
+    peg = {"radius": PEG, "half_height": 0.5 * GAP, "color": (0.75, 0.2, 0.2)}
     for x, z in PEGS:
-        place = wp.transform((x, 0.0, z), across)
-        world.add_shape_cylinder(-1, xform=place, radius=PEG, half_height=0.5 * GAP, color=(0.75, 0.2, 0.2))
+        world.add_shape_cylinder(-1, xform=wp.transform((x, 0.0, z), across), **peg)
 
 
 def turned_to_fit(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return a random rotation by which points (N, 3) fit between the panes and beside each other."""
     while True:
         turn = Rotation.from_quat(rng.normal(size=4)).as_matrix()
-        width, depth, _ = np.ptp(points @ turn.T, axis=0)
-        if width < 0.085 and depth < GAP - 0.006:
+        if (np.ptp(points @ turn.T, axis=0)[:2] < (0.085, GAP - 0.006)).all():
             return turn
 
 
@@ -77,8 +67,8 @@ def make_scene(own: list[str | ObjectConfig], seed: int, height: int, device: st
     for i, k in enumerate(rng.permutation(len(toys))):
         (source, size, stiffer), (row, column) = toys[k], divmod(i, 6)
         thing = load(source, size=size, surface_count=SAMPLES, build=BUILD)
-        stuff = thing.material or PLUSH
-        stuff = replace(stuff, youngs_modulus=stiffer * stuff.youngs_modulus, friction=0.3)
+        stuff = replace(thing.material or PLUSH, friction=0.3)
+        stuff = replace(stuff, youngs_modulus=stiffer * stuff.youngs_modulus)
         place = (0.09 * (column - 2.5) + rng.uniform(-0.005, 0.005), 0.0, 0.80 + 0.11 * row)
         turn = turned_to_fit(thing.body.surface.points, rng)
         placed.append(Placed(object=replace(thing, material=stuff), position=place, rotation=turn))
@@ -118,7 +108,6 @@ def main() -> None:
     parser.add_argument("--short", action="store_true", help="0.6 s in small pictures, not 3 s")
     arguments = parser.parse_args()
     own = [*arguments.object, *(ObjectConfig(splat=file) for file in arguments.splat)]
-    wp.config.log_level = wp.LOG_WARNING
     scene = make_scene(own, arguments.seed, 200 if arguments.short else 640, arguments.device)
     with Film(arguments.video) as film:
         record = scene.record(film, 18 if arguments.short else 90, depth_in_board)

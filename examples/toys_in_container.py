@@ -85,7 +85,6 @@ def main() -> None:
     parser.add_argument("--device")
     parser.add_argument("--short", action="store_true", help="1.6 s in small pictures, not 2 s")
     given = parser.parse_args()
-    wp.config.log_level = wp.LOG_WARNING
     own = [*given.object, *(ObjectConfig(splat=file) for file in given.splat)]
     scene = make_scene(own, given.seed, 160 if given.short else 480, given.device)
     with Film(given.video) as film:
