@@ -12,7 +12,6 @@ import warp as wp
 
 from softmode.deformables.contact.cell_kernels import (
     NEAR,
-    CellShape,
     Surface,
     cell_at,
     fade_of,
@@ -21,7 +20,6 @@ from softmode.deformables.contact.cell_kernels import (
     touched_share,
     write_row,
 )
-from softmode.deformables.contact.crease_kernels import REACH, Crease, crease_at, narrow_dent, near_edge
 from softmode.deformables.contact.penalty_kernels import (
     BULK_FACTOR,
     HARDENING_DEPTH,
@@ -33,7 +31,6 @@ from softmode.deformables.contact.penalty_kernels import (
     stiffness_per_area,
 )
 from softmode.deformables.contact.shape_query_kernels import (
-    BOX,
     CAPSULE,
     CYLINDER,
     HEIGHTFIELD,
@@ -44,7 +41,6 @@ from softmode.deformables.contact.shape_query_kernels import (
     SurfaceQuery,
     query_heightfield,
     query_shape,
-    signs,
 )
 from softmode.deformables.model.declare import struct
 from softmode.deformables.model.deformation_kernels import displacement_gradient
@@ -318,7 +314,6 @@ def find_contacts(
     samples.gap[i, s, 1] = wp.float64(1.0e30)
     x = samples.position[i, s]
     row = instances.row_start[i] + s
-    side = instances.scale[i] * wp.sqrt(basis.row_area[row])
     stuck = stick_shape[instances.particle_start[i] + s]
     for c in range(candidate.shape[1]):
         if near[i, c] == 0 or (c < CULLED and (samples.near[i, s] >> c) & 1 == 0):
@@ -368,11 +363,6 @@ def find_contacts(
             end = travel
         if end > 0.0:
             query = march(shapes, shape, local, query, along, end, back, thick, instances.smoothing[i], far)
-        if kind == BOX and query.distance >= reach and query.distance < REACH * side:
-            if near_edge(local, shapes.scale[shape], -signs(local), side):
-                F = gradient_of(instances, basis, motion.q_start, i, row)
-                outward = wp.quat_rotate_inv(turn, wp.vec3(F * wp.vec3d(basis.row_normal[row])))
-                reach = wp.where(near_edge(local, shapes.scale[shape], outward, side), REACH * side, reach)
         gap = wp.float64(query.distance)
         if gap < wp.float64(reach) and gap < samples.gap[i, s, 1]:
             normal = wp.quat_rotate(turn, query.normal)
@@ -459,31 +449,6 @@ def shape_frame(shapes: Shapes, shape: int):
     if body >= 0:
         pose = shapes.body_q[body] * pose
     return wp.vec3d(wp.transform_get_translation(pose)), wp.normalize(wp.quatd(wp.transform_get_rotation(pose)))
-
-
-@wp.func
-def crease_of(
-    instances: Instances,
-    basis: Basis,
-    shapes: Shapes,
-    samples: Samples,
-    cell: CellShape,
-    F: wp.mat33d,
-    i: int,
-    row: int,
-    shape: int,
-    gap: wp.float64,
-):
-    """Return what the faces of a shape press of the cell of a sample, if it is a box; see ``crease_kernels``."""
-    crease = Crease()
-    if shapes.kind[shape] == BOX:
-        origin, rotation = shape_frame(shapes, shape)
-        x = wp.quat_rotate_inv(rotation, samples.position[i, row - instances.row_start[i]] - origin)
-        grown = shapes.margin[shape] + instances.contact_radius[i]
-        local = wp.transpose(wp.quat_to_matrix(rotation)) * F
-        crease = crease_at(shapes.scale[shape], x, local, cell, basis.row_area[row], float(gap), grown)
-        crease.normal = wp.quat_rotate(rotation, crease.normal)
-    return crease
 
 
 @wp.func
@@ -625,22 +590,12 @@ def gather_contacts(
         ahead = wp.mat33d()
         closing = wp.float64(0.0)
         spared = float(1.0)
-        area = wp.max(sample_area(instances.scale[i], basis.row_area[row]), 1.0e-30)
-        crease = Crease()
-        close = gap <= NEAR * cell_shape.steepest
-        beside = shapes.kind[shape] == BOX
-        if beside:
-            origin, rotation = shape_frame(shapes, shape)
-            x = wp.vec3(wp.quat_rotate_inv(rotation, samples.position[i, s] - origin))
-            beside = near_edge(x, shapes.scale[shape], -signs(x), 6.0 * wp.sqrt(area))
-        if close or beside:
+        if gap <= NEAR * cell_shape.steepest:
             start, ahead, closing = motion_of_cell(instances, basis, motion, shapes, samples, i, row, shape, normal, dt)
-        if beside:
-            crease = crease_of(instances, basis, shapes, samples, cell_shape, start, i, row, shape, gap)
-        if close or crease.found == 1:
             fade = fade_of(cell_shape, ahead, normal)
             touched = touched_share(surface, samples.shape, samples.gap, cell_shape, fade, i, row, shape)
             spared = float(wp.float64(1.0) - touched * touched)
+        area = wp.max(sample_area(instances.scale[i], basis.row_area[row]), 1.0e-30)
         relative = surface.relative_stiffness[row]
         partner_mass = float(0.0)
         if shapes.body[shape] >= 0 and prescribed == 0:
@@ -649,13 +604,7 @@ def gather_contacts(
         firm = relative * surface.slenderness[row]
         kappa = stiffness_per_area(instances, i, BULK_FACTOR, firm, partner_mass, partner_area, dt)
         stiffness = wp.float64(kappa * area)
-        length = surface.dent_length[row]
-        if crease.found == 1:
-            length = narrow_dent(spared * length, crease.width)
-            spared = float(1.0)
-            area *= float(crease.firmness)
-            stiffness *= crease.firmness
-        compliance = wp.float64(spared * dent_compliance(instances, i, relative, length) / area)
+        compliance = wp.float64(spared * dent_compliance(instances, i, relative, surface.dent_length[row]) / area)
         share = float(1.0)
         if partner_mass > 0.0:  # what is light beside the body turns faster than its cells, which lag by a step
             share = partner_mass / (partner_mass + float(instances.mass[i]))
@@ -663,12 +612,6 @@ def gather_contacts(
         ratio = stiffness * compliance * wp.float64(share * share)
         cell = cell_at(cell_shape, ahead, normal, gap, closing, ratio)
         turned = wp.dot(normal, (ahead - start) * cell.centre)
-        if crease.found == 1:
-            normal = crease.normal
-            cell.onset = crease.onset
-            cell.lead = wp.float64(0.0)
-            cell.centre = crease.centre
-            turned = gap + crease.penetration
         # both bodies feel the force at one point, not the shape at its own surface: a pair of forces on two
         # points would make angular momentum out of friction times penetration
         point = wp.vec3(samples.position[i, s] + start * cell.centre)
@@ -687,7 +630,7 @@ def gather_contacts(
         constraints.arm[i, e] = arm
         constraints.normal[i, e] = normal
         shear = stiffness_per_area(instances, i, SHEAR_FACTOR, relative, partner_mass, partner_area, dt)
-        edged = crease.found == 0 and (SMOOTH >> shapes.kind[shape]) & 1 == 0
+        edged = (SMOOTH >> shapes.kind[shape]) & 1 == 0
         slip, anchor = remembered_slip(
             shapes,
             shape,

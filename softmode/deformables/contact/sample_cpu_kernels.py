@@ -2,7 +2,6 @@
 
 import warp as wp
 
-from softmode.deformables.contact.crease_kernels import REACH
 from softmode.deformables.contact.detection_kernels import CULLED, Shapes
 from softmode.deformables.contact.shape_query_kernels import HEIGHTFIELD, PLANE
 from softmode.deformables.model.interpolation_cpu_kernels import interpolate_rows
@@ -13,7 +12,7 @@ wp.set_module_options({"enable_backward": False})
 
 SLACK = 1.0e-5
 """Rounding of distances in float32, over the larger of 1 m and the coordinates of a shape."""
-NAMES = {"CULLED": int(CULLED), "PLANE": PLANE, "HEIGHTFIELD": HEIGHTFIELD, "SLACK": SLACK, "REACH": float(REACH)}
+NAMES = {"CULLED": int(CULLED), "PLANE": PLANE, "HEIGHTFIELD": HEIGHTFIELD, "SLACK": SLACK}
 
 
 @wp.kernel
@@ -97,16 +96,14 @@ def _cull_snippet() -> str:
     const float* drift = (const float*)samples.drift.data + 3 * first;
     const double* inner = (const double*)basis.inner_point.data + 3 * (size_t)instances.row_start.data[i];
     const double scale = instances.scale.data[i], margin = instances.margin.data[i];
-    const float* area = basis.row_area.data + instances.row_start.data[i];
     const int* memory = (const int*)stick_shape.data + 2 * (size_t)instances.particle_start.data[i];
     const bool fresh = dt_before.data[i] == 0.0;
     int* out = (int*)samples.near.data + first;
     for (int s = 0; s < sample_count; s += 8) {
-        lanes x[3], move[3], depth = 0.0, wide;
+        lanes x[3], move[3], depth = 0.0;
         words stuck[2];
         for (int lane = 0; lane < 8; ++lane) {
             const int sample = s + lane < sample_count ? s + lane : sample_count - 1, at = 3 * sample;
-            wide[lane] = area[sample];
             for (int k = 0; k < 2; ++k) stuck[k][lane] = memory[2 * sample + k];
             for (int k = 0; k < 3; ++k) {
                 x[k][lane] = position[at + k];
@@ -115,12 +112,10 @@ def _cull_snippet() -> str:
             }
         }
         depth = 2.0 * scale * __builtin_elementwise_sqrt(depth);
-        wide = scale * __builtin_elementwise_sqrt(wide);
         words bits = (words)(long long)passed;
         for (int n = 0; n < frame_count; ++n) {
             const Frame& f = frames[n];
             lanes gap = 0.0, travel = 0.0, arm[3], from[3];
-            words beside = 0;
             for (int k = 0; k < 3; ++k) {
                 arm[k] = x[k] - f.centre[k];
                 from[k] = x[k] - f.origin[k];
@@ -128,15 +123,13 @@ def _cull_snippet() -> str:
             for (int k = 0; k < 3; ++k) {
                 const lanes local = f.turn[k] * from[0] + f.turn[3 + k] * from[1] + f.turn[6 + k] * from[2];
                 lanes away = local - f.upper[k] > f.lower[k] - local ? local - f.upper[k] : f.lower[k] - local;
-                beside -= away > -wide - f.slack;
                 away = away > 0.0 ? away : (lanes)0.0;
                 gap += away * away;
                 const int l = (k + 1) % 3, m = (k + 2) % 3;
                 const lanes moving = f.linear[k] + f.angular[l] * arm[m] - f.angular[m] * arm[l];
                 travel += (move[k] - moving) * (move[k] - moving);
             }
-            lanes reach = margin + 2.0 * __builtin_elementwise_sqrt(travel);
-            reach = ((beside > 1) & (REACH * wide > reach)) ? REACH * wide : reach;
+            const lanes reach = margin + 2.0 * __builtin_elementwise_sqrt(travel);
             const words shape = (words)(long long)f.shape, bit = (words)(long long)f.bit;
             const words touched = (stuck[0] == shape) | (stuck[1] == shape) | (fresh ? ~(words)0 : (words)0);
             const lanes within = ((touched & (depth > reach)) ? depth : reach) + f.thick + f.slack;

@@ -24,13 +24,7 @@ from softmode.deformables.contact.cell_kernels import (
     touched_share,
     write_row,
 )
-from softmode.deformables.contact.detection_kernels import (
-    Shapes,
-    crease_of,
-    curvature_of,
-    motion_of_cell,
-    shape_area,
-)
+from softmode.deformables.contact.detection_kernels import Shapes, curvature_of, motion_of_cell, shape_area
 from softmode.deformables.contact.penalty_kernels import (
     BULK_FACTOR,
     HARDENING,
@@ -151,8 +145,6 @@ def accumulate_cells(
     gap = gap_of(instances, samples, i, row, shape)
     other = curvature_of(shapes, shape, n)
     cell_shape = shape_of_cell(surface, instances, basis, i, row, other)
-    if crease_of(instances, basis, shapes, samples, cell_shape, start, i, row, shape, gap).found == 1:
-        return  # its normal turns too: refused, or taken for fixed as a whole
     back = step.contact_bar[i, e]
     along = wp.dot(n, back)
     centre_bar = wp.vec3d()
@@ -231,15 +223,11 @@ def restore_rows(
         return
     shape = constraints.shape[i, e]
     n = constraints.normal[i, e]
-    start, ahead, closing = motion_of_cell(instances, basis, motion, shapes, samples, i, row, shape, n, dt)
+    _start, ahead, closing = motion_of_cell(instances, basis, motion, shapes, samples, i, row, shape, n, dt)
     cell_shape = shape_of_cell(surface, instances, basis, i, row, curvature_of(shapes, shape, n))
     ratio = constraints.stiffness[i, e] * constraints.dent_compliance[i, e]
-    gap = gap_of(instances, samples, i, row, shape)
-    centre = cell_at(cell_shape, ahead, n, gap, closing, ratio).centre
-    crease = crease_of(instances, basis, shapes, samples, cell_shape, start, i, row, shape, gap)
-    if crease.found == 1:
-        centre = crease.centre
-    write_row(basis, constraints.row[i, e], row, centre)
+    cell = cell_at(cell_shape, ahead, n, gap_of(instances, samples, i, row, shape), closing, ratio)
+    write_row(basis, constraints.row[i, e], row, cell.centre)
 
 
 @wp.kernel
