@@ -159,7 +159,7 @@ def crease_at(half: wp.vec3, x: wp.vec3d, F: wp.mat33d, shape: CellShape, area: 
         centre += depth * (a * first + b * second)
     if pressed == zero:
         crease.normal = -outward
-        crease.penetration = -least
+        crease.penetration = -wp.min(least, NUMBER * wp.length(u))  # nothing lies under a cell beside the box
         crease.onset = wp.length(u) * NUMBER / two + shape.least
         crease.firmness = one
         crease.width = shape.width
