@@ -33,8 +33,6 @@ SLENDER = wp.constant(wp.float64(0.5))
 a wide patch: a strip on a half plane gives by the logarithm."""
 AROUND = wp.constant(wp.float64(3.0))
 """Side of what is looked at of a patch to know how wide it is, in cells."""
-ROUNDING = wp.constant(1.0e-6)
-"""Of distances to a box in float32, over 1 m and its half diagonal."""
 REACH = wp.constant(0.75)
 """Distance to a box over the side of a cell up to which an edge may lie in the cell."""
 
@@ -126,8 +124,7 @@ def crease_at(half: wp.vec3, x: wp.vec3d, F: wp.mat33d, shape: CellShape, area: 
             turn = wp.vec2d(u[k], v[k]) * side[k] / facing[k] - wp.vec2d(u[best], v[best]) * side[best] / facing[best]
             if away[best] / facing[best] - away[k] / facing[k] < wp.length(turn) * NUMBER:
                 crease.found = 1
-    nearest = query_box(wp.vec3(x), half).distance - grown
-    if crease.found == 0 or wp.abs(nearest - gap) > ROUNDING * (1.0 + wp.length(half)):
+    if crease.found == 0 or wp.abs(query_box(wp.vec3(x), half).distance - grown - gap) > 1.0e-6:
         return Crease()
     pressed = zero
     sloping = zero
@@ -159,8 +156,8 @@ def crease_at(half: wp.vec3, x: wp.vec3d, F: wp.mat33d, shape: CellShape, area: 
         centre += depth * (a * first + b * second)
     if pressed == zero:
         crease.normal = -outward
-        crease.penetration = -wp.min(least, NUMBER * wp.length(u))  # nothing lies under a cell beside the box
-        crease.onset = wp.length(u) * NUMBER / two + shape.least
+        crease.penetration = -least
+        crease.onset = part * NUMBER / two + shape.least
         crease.firmness = one
         crease.width = shape.width
         return crease
