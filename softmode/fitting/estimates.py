@@ -75,15 +75,14 @@ def asked_for(
     for name in free:
         unit, reason = {"mass_damping": "1/s", "density": "kg/m^3"}.get(name, ""), UNSEEN.get(name, "")
         value, deviation = float(getattr(material, name)), 0.0
+        low = high = value
         if not reason:
             at = space.names.index(name)
             value, deviation = float(x[at]), deviations[name]
+            low, high = max(value - deviation, float(space.low[at])), min(value + deviation, float(space.high[at]))
             if deviation > 0.5 * space.prior[at]:
-                reason = (
-                    f"the data look the same from {value - deviation:.2g} to {value + deviation:.2g} {unit}".rstrip()
-                )
-        bars = {"low": value - deviation, "high": value + deviation}
-        found[name] = Estimate(value=value, **bars, observable=not reason, unit=unit, reason=reason)
+                reason = f"the data look the same from {low:.2g} to {high:.2g} {unit}".rstrip()
+        found[name] = Estimate(value=value, low=low, high=high, observable=not reason, unit=unit, reason=reason)
     return found
 
 

@@ -34,6 +34,8 @@ RAYS, REGULAR = 4096, 6000
 """Rays of a step on the fine grid, half as many on the coarse one; nodes with neighbours of a step."""
 WIDEST, SHARPEST = 1.0, 0.4
 """beta of the coarse grid, and at the end of the fine one [voxels]."""
+AT_ONCE = 1 << 16
+"""Rays of a picture whose light is followed at a time."""
 FOG, LIT = 3.0, 0.5
 """What nodes of the hull begin with [voxels]: a fortieth of the light is lost in a voxel; a node is lit where so much
 of the light of two pictures comes to it."""
@@ -288,9 +290,13 @@ class Walls:
     @torch.no_grad()
     def lit(self, eye: torch.Tensor, way: torch.Tensor, first: torch.Tensor, last: torch.Tensor) -> torch.Tensor:
         """Return which nodes (n^3,) light of rays comes to."""
-        shape, use, rows, weight = self._samples(eye, way, first, last, 0.7)
-        light = self._depths(shape, use, rows, weight, 0.7, SHARPEST)[1].reshape(-1)[use]
-        found = torch.zeros(len(self.s)).scatter_reduce(0, rows.gather(1, weight.argmax(1, True))[:, 0], light, "amax")
+        found = torch.zeros(len(self.s))
+        for some in torch.arange(len(way)).split(AT_ONCE) if len(way) else ():
+            shape, use, rows, weight = self._samples(
+                eye.expand(way.shape)[some], way[some], first[some], last[some], 0.7
+            )
+            light = self._depths(shape, use, rows, weight, 0.7, SHARPEST)[1].reshape(-1)[use]
+            found.scatter_reduce_(0, rows.gather(1, weight.argmax(1, True))[:, 0], light, "amax")
         return found[self.rows] > LIT
 
     def march(

@@ -23,6 +23,8 @@ from softmode.usd.writer import float_array, new_layer, new_stage, prim_name, sa
 
 _SAVE_BYTES = 64e6
 """After so many bytes of samples the layer is saved, which takes them out of memory."""
+MOST_NODES = 3.0e8
+"""Of the grid that a mesh is found on: some 5 GB."""
 
 
 def write_splat_animation(
@@ -49,7 +51,7 @@ def write_splat_animation(
 
     Raises:
         ConfigError: If there is no frame, the number of splats changes, the file's name does not end like a stage, or
-            `shown` is no choice.
+            `shown` is no choice, or a mesh is wanted of splats that do not fill a body.
         StorageError: If the file cannot be written.
         MissingExtraError: If the extra `[usd]` is not installed.
     """
@@ -72,6 +74,9 @@ def write_splat_animation(
                 if shown == "mesh":
                     UsdGeom.Mesh.Define(stage, prim).CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
                     cell = 0.5 * float(np.median(KDTree(splats.means).query(splats.means, k=2)[0][:, 1]))
+                    if not 0.0 < cell < np.inf:
+                        hint = 'give evenly spread ones, such as particles, or write shown="points"'
+                        raise ConfigError("frames: a mesh needs splats at different places", hint=hint)
                 elif shown == "points":
                     points = UsdGeom.Points.Define(stage, prim)
                     points.SetWidthsInterpolation(UsdGeom.Tokens.vertex)
@@ -116,6 +121,9 @@ def _set_surface(mesh: Any, splats: Splats, cell: float, time: int) -> int:
     low = splats.means.min(axis=0) - 5.0 * cell
     node: NDArray[np.int64] = np.floor((splats.means - low) / cell).astype(np.int64)
     shape = node.max(axis=0) + 6
+    if np.prod(shape.astype(float)) > MOST_NODES:
+        hint = 'leave out what has flown away, or write shown="points"'
+        raise ConfigError(f"frames: frame {time} spans {' x '.join(map(str, shape))} cells of a mesh", hint=hint)
     full = np.bincount(np.ravel_multi_index(tuple(node.T), shape), minlength=int(np.prod(shape))).reshape(shape)
     found, faces = marching_cubes(0.5 / 8.0 - gaussian_filter(full.astype(np.float64), 1.5))
     points = low + cell * (found + 0.5)

@@ -15,6 +15,7 @@ import threading
 import time
 from pathlib import Path
 
+import newton
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -23,6 +24,8 @@ from hypothesis import strategies as st
 from softmode.deformables.body.records import BodyCubature
 from softmode.deformables.body.reduced_body import FORMAT_VERSION, ReducedBody
 from softmode.deformables.body.regions import Region
+from softmode.deformables.materials.material import Material
+from softmode.deformables.model.authoring import add_reduced_body
 from softmode.deformables.quadrature.quadrature import (
     quadrature_from_box,
     quadrature_from_capsule,
@@ -187,7 +190,7 @@ def test_density_moves_the_frame(uneven: ReducedBody, quadrature: Quadrature) ->
 def test_fields_reach_the_points(uneven: ReducedBody, quadrature: Quadrature, tmp_path: Path) -> None:
     """Cubature points have the modulus and the Poisson's ratio of the quadrature point they are, and a file keeps them.
 
-    Where the ratio varies, what is stored is relative to the ratio of the options.
+    Where the ratio varies, what is stored is relative to the ratio of the options; a negative one is refused.
     """
     uneven.save(tmp_path / "uneven.npz")
     body, stiff = ReducedBody.load(tmp_path / "uneven.npz"), FIELDS["stiffness_scale"](quadrature.points)
@@ -197,6 +200,8 @@ def test_fields_reach_the_points(uneven: ReducedBody, quadrature: Quadrature, tm
     np.testing.assert_allclose(ratio, FIELDS["poissons_ratio"](quadrature.points)[index], rtol=1e-13, atol=1e-15)
     wide = body.cubature.moduli(1.0, 0.49)[1]
     assert wide.max() < 0.5 and (wide >= ratio).all()
+    with pytest.raises(MaterialError, match=r"poissons_ratio is -0.1, and that of body .* varies"):
+        add_reduced_body(newton.ModelBuilder(), body, material=Material(poissons_ratio=-0.1))
 
 
 def test_fields_may_be_functions_of_position(uneven: ReducedBody, quadrature: Quadrature) -> None:

@@ -73,7 +73,7 @@ def test_what_light_reaches_is_empty() -> None:
         walls = Walls(np.where(hull, -1.0, 5.0), np.zeros((n, n, n, 3)), fog=True)
         with torch.no_grad():
             walls.s[2:, 0] = torch.tensor(np.where(dense, -1.0, 3.0)[walls.near])
-        lit = torch.zeros(n**3)
+        lit = walls.lit(*torch.zeros(2, 0, 3), *torch.zeros(2, 0)).float()  # a picture that looks aside lights none
         for tilt in (0.0, 0.1):
             eye = torch.cat([places, torch.full((len(places), 1), 60.0)], dim=1)
             way = torch.tensor([tilt, 0.0, -1.0]).expand(len(places), 3)

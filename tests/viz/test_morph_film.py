@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -127,6 +128,11 @@ def test_a_stage_holds_every_frame(scenes: list[MorphScene], tmp_path: Path) -> 
         write_splat_animation(tmp_path / "none.usdc", [])
     with pytest.raises(ConfigError, match="frame 1 has 3 splats"):
         write_splat_animation(tmp_path / "none.usdc", [frames[0], frames[1].subset(np.arange(3))])
+    few = frames[0].subset(np.arange(9))
+    far = replace(few, means=few.means + np.where(np.arange(9) == 8, 1.0e3, 0.0)[:, None])
+    for odd, match in ((few.subset(np.zeros(2, int)), "at different places"), (far, "frame 0 spans")):
+        with pytest.raises(ConfigError, match=match):
+            write_splat_animation(tmp_path / "none.usdc", [odd], shown="mesh")
     assert not (tmp_path / "none.usdc").exists()
 
 

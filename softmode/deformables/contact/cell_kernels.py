@@ -49,7 +49,7 @@ LEVEL = wp.constant(wp.float64(1.0e-3))
 class Surface:
     """What contact knows of the surface samples of all bodies, (sample_total,) where not said."""
 
-    relative_stiffness: wp.array[float]  # Young's modulus relative to the body's
+    relative_stiffness: wp.array[float]  # shear modulus relative to the body's
     dent_length: wp.array[float]  # dent at scale 1 under the pressure E / (1 - nu^2), see ``dents`` [m]
     slenderness: wp.array[float]  # size of the body over the smaller of it and three thicknesses
     curvature: wp.array[float]  # mean curvature of the asset at rest [1/m]

@@ -106,7 +106,7 @@ def surface_table(
 
     Args:
         bodies: The bodies.
-        stiffness: Young's modulus at all samples relative to that of their body.
+        stiffness: Shear modulus at all samples relative to that of their body.
         first_row: First of the rows at centres of pressure.
         row_max: Such rows of an instance.
         device: Where the table lies.

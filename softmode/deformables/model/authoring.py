@@ -15,7 +15,7 @@ from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.namespaces import NAMESPACE, soft
 from softmode.deformables.model.struct_kernels import mat23d, p_wave_modulus
-from softmode.errors import ConfigError
+from softmode.errors import ConfigError, MaterialError
 
 _INSTANCE = f"{NAMESPACE}:instance"
 _FUNCTION = f"{NAMESPACE}:function"
@@ -163,6 +163,8 @@ def add_reduced_body(
     Raises:
         ConfigError: If the pose, a velocity, a stiffness or a radius is not finite, the rotation is no rotation, or the
             scale lies outside its range.
+        MaterialError: If Poisson's ratio is negative and that of the body varies: lambda / mu would keep its
+            proportions down to where nothing is stable.
     """
     register_custom_attributes(builder)
     material = material or Material()
@@ -176,6 +178,11 @@ def add_reduced_body(
     require_number("scale", scale, at_least=SCALE_MIN, at_most=SCALE_MAX, hint=hint)
     s = float(np.float32(scale))  # as the model stores it
     spin = np.array([[0, -omega[2], omega[1]], [omega[2], 0, -omega[0]], [-omega[1], omega[0], 0]])
+    if len(body.cubature.lame_ratio) and material.poissons_ratio < 0.0:
+        raise MaterialError(
+            f"poissons_ratio is {material.poissons_ratio:g}, and that of body {body.name!r} varies",
+            hint="give one of 0 or more, or build the body without a field of Poisson's ratios",
+        )
     if not body.serves_ratio(material.poissons_ratio):
         warnings.warn(
             f"body {body.name!r} has functions for another Poisson's ratio than {material.poissons_ratio:g}: it comes"
