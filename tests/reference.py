@@ -344,10 +344,15 @@ class Surface:
         return I3 + np.einsum("kc,skd->scd", self.q, gradients)
 
     @cached_property
-    def normals(self) -> np.ndarray:
-        """Outward unit normals, cof(F) N, (S, 3)."""
+    def area_vectors(self) -> np.ndarray:
+        """Areas times outward normals, A cof(F) N, (S, 3) [m^2]."""
         n = np.einsum("scd,sd->sc", cofactor(self.deformation_gradient), self.body.surface.normals)
-        return n / np.linalg.norm(n, axis=1, keepdims=True)
+        return self.body.surface.areas[:, None] * n
+
+    @cached_property
+    def normals(self) -> np.ndarray:
+        """Outward unit normals, (S, 3)."""
+        return self.area_vectors / np.linalg.norm(self.area_vectors, axis=1, keepdims=True)
 
     @property
     def spacing(self) -> float:
@@ -410,7 +415,7 @@ class Surface:
         height, square = np.einsum("sc,sc->s", self.normals, away), (away**2).sum(axis=1)
         aside = np.sqrt(np.maximum(square - height**2, 0.0))
         nearer = faces & (2.0 * np.abs(height) < depth) & (aside < 1.2 * self.spacing)
-        areas = self.body.surface.areas
+        areas = np.linalg.norm(self.area_vectors, axis=1)
         winding = (areas * height / (square + 0.1 * areas) ** 1.5).sum() / (4.0 * np.pi)
         return bool(nearer.any() or winding <= 0.4)
 

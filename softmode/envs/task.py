@@ -537,8 +537,11 @@ def _check_grasps(held: Occupancy, jaw: ParallelJaw) -> None:
 
 
 def _kept(config: TaskConfig, thing: SoftObject, material: Material) -> dict[str, tuple[float, float]]:
-    """Return the ranges of the properties of an object of a set that have none: as it is, or as a fit says, E."""
-    names = [name for name in Materials.NAMES if name != "scale"] if config.object_set is not None else []
+    """Return the ranges of the properties of an object of a set that have none: as it is, or as a fit says, E.
+
+    Of one object alone only the density: a field of material says it of the solid, not of its points.
+    """
+    names = [name for name in Materials.NAMES if name != "scale"] if config.object_set is not None else ["density"]
     own = {name: getattr(material, name) for name in names if getattr(config, f"{name}_range") is None}
     ranges = {name: (value, value) for name, value in own.items()}
     low, value, high = stored_bars(thing.body).get("youngs_modulus", (0.0, 0.0, 0.0))

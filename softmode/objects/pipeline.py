@@ -223,7 +223,8 @@ def dressed(body: ReducedBody, config: ObjectConfig, source: ObjectSource, mater
     if config.material_file is not None and (own := config.material) is not None:
         # The mean over the solid, so that its mass is that of the field.
         mean = replace(own, density=float(body.provenance.get("field_density") or own.density))
-        material = mean if material == own else material
+        if material is not None and material.density == own.density:
+            material = replace(material, density=mean.density)
         told["material"] = json.dumps({name: getattr(mean, name) for name in (*PROPERTIES, "friction")})
     notes = source.notes
     if (missed := body.provenance.get("field_missed")) is not None:

@@ -83,7 +83,7 @@ class Occupancy:
 
         self.choices: tuple[SoftObject, ...] = tuple(loaded_once(kind, own) for kind, own in kinds)
         self.materials = tuple(
-            own or made.material or material for made, (_, own) in zip(self.choices, kinds, strict=True)
+            made.material or own or material for made, (_, own) in zip(self.choices, kinds, strict=True)
         )
         self.others = tuple(loaded_once(kind, material) for kind in others)
         self._least, self.slots = (1, 1) if given is None else given.number_range

@@ -5,6 +5,7 @@ Builds bars from painted fields, since paint is a field of the build.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -149,7 +150,8 @@ def test_an_object_by_a_material_field(tmp_path) -> None:
     shape = {"shape": "box", "extents": SIZE, "splat_count": 800, "surface_count": 80, "build": OPTIONS}
     wide = (*[-np.inf] * 3, *[np.inf] * 3)
     base = ObjectConfig(**shape, stiffness=(StifferBox(box=wide, factor=3.0),))
-    thing = load(base.changed(material_file=written()))
+    config = base.changed(material_file=written())
+    thing = load(config)
     given, made = unpack_sources(thing.body), thing.material
     high = given.quadrature.points[:, 2] - given.quadrature.bounds[0, 2] > 0.58 * SIZE[2]  # beside the jump
     low = given.quadrature.points[:, 2] - given.quadrature.bounds[0, 2] < 0.54 * SIZE[2]
@@ -161,6 +163,8 @@ def test_an_object_by_a_material_field(tmp_path) -> None:
     assert given.density_scale is not None
     share = given.quadrature.weights @ given.density_scale / given.quadrature.volume
     np.testing.assert_allclose(made.density * given.density_scale[high] / share, 600.0)
+    assert config.material is not None and config.material.density != made.density  # of the points, of the solid
+    assert load(config, material=replace(config.material, friction=0.9)).material == replace(made, friction=0.9)
     sparse = base.changed(material_file=written(points=points * (1.0, 1.0, 0.8)))
     with pytest.warns(RuntimeWarning, match="misses .* % of the object"):
         load(sparse)

@@ -106,6 +106,7 @@ class Pairs:
     first_row: int  # first dynamic row
     neighbour: wp.array2d[int]  # (sample_total, NEIGHBOURS), nearest samples at rest, the sample itself first; -1 pads
     surface_normal: wp.array2d[wp.vec3]  # outward, of unit length
+    surface_area: wp.array2d[float]  # of the cells as they are deformed [m^2]
     thickness: wp.array[float]  # (sample_total,), of the asset at rest below each static row [m]
     spacing: wp.array[float]  # (instance_count,) of the samples [m]
     near: wp.array[int]  # (instance_count,), whether its bounds meet those of another body
@@ -185,13 +186,15 @@ def place_surface(
     # Out:
     pairs: Pairs,
 ):
-    """Write the normals cof(F) N of the bodies that are near another."""
+    """Write the areas A |cof(F) N| and the normals cof(F) N of the bodies that are near another."""
     i, s = wp.tid()
     if s >= instances.sample_count[i] or pairs.near[i] == 0:
         return
-    F = gradient_of(instances, basis, motion.q_start, i, instances.row_start[i] + s)
-    normal = wp.normalize(cofactor(F) * wp.vec3d(basis.row_normal[instances.row_start[i] + s]))
-    pairs.surface_normal[i, s] = wp.vec3(normal)
+    row = instances.row_start[i] + s
+    F = gradient_of(instances, basis, motion.q_start, i, row)
+    normal = cofactor(F) * wp.vec3d(basis.row_normal[row])
+    pairs.surface_normal[i, s] = wp.vec3(wp.normalize(normal))
+    pairs.surface_area[i, s] = basis.row_area[row] * float(wp.length(normal))
 
 
 @wp.func
@@ -282,12 +285,12 @@ def is_nearer(samples: Samples, pairs: Pairs, i: int, s: int, j: int, row: int, 
 
 
 @wp.func
-def is_inside(instances: Instances, basis: Basis, samples: Samples, pairs: Pairs, x: wp.vec3d, j: int):
+def is_inside(instances: Instances, samples: Samples, pairs: Pairs, x: wp.vec3d, j: int):
     """Return whether x lies in instance j by the winding number of its samples, sum A_k n_k . r_k / (4 pi r_k^3)."""
     total = wp.float64(0.0)
     for t in range(instances.sample_count[j]):
         away = samples.position[j, t] - x
-        area = wp.float64(sample_area(instances.scale[j], basis.row_area[instances.row_start[j] + t]))
+        area = wp.float64(pairs.surface_area[j, t])
         distance = wp.length_sq(away) + wp.float64(0.1) * area  # finite at a sample
         slope = wp.dot(wp.vec3d(pairs.surface_normal[j, t]), away)
         total += area * slope / (distance * wp.sqrt(distance))
@@ -345,7 +348,7 @@ def fit_patch(
     elif beside(samples, pairs, x, j, row, x - offset, patch.normal):
         patch.total = wp.float64(0.0)
     elif j != i and patch.gap < wp.float64(-0.5) * wp.min(wp.float64(pairs.spacing[j]), wp.float64(wall)):
-        if is_nearer(samples, pairs, i, s, j, row, -patch.gap) or not is_inside(instances, basis, samples, pairs, x, j):
+        if is_nearer(samples, pairs, i, s, j, row, -patch.gap) or not is_inside(instances, samples, pairs, x, j):
             patch.total = wp.float64(0.0)
     return patch
 

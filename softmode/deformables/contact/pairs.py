@@ -30,7 +30,7 @@ from softmode.deformables.model.tables import allocate
 _AXES = {
     "": "instance sample slot",
     "near count": "instance",
-    "surface_normal": "instance sample",
+    "surface_normal surface_area": "instance sample",
     "sample constraint mirror": "instance pair",
     "tally": "instance team 2",
 }
