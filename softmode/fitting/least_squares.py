@@ -18,7 +18,9 @@ KEPT = 3
 HUBER = 2.5
 """Residuals beyond this count by their size and not by its square."""
 TOLERANCE = 1.0e-3
-"""Relative change of the cost, and of the parameters in their priors, at which it ends."""
+"""Relative change of the cost, and of the parameters' norm, at which a search ends: of ln E it is about 1 %."""
+AT_END = 0.01
+"""Distance from its least or largest value at which a parameter has come to it."""
 
 _FIELDS = ("mean", "prior", "step", "low", "high")
 
@@ -80,8 +82,8 @@ class Solution:
 
         Of two the larger: that of Gauss and Newton with the priors, times chi where it is above one, and the jackknife
         over blocks of residuals that may err together (MacKinnon and White 1985, doi:10.1016/0304-4076(85)90158-7): a
-        plain sandwich is too small where a few blocks, such as the first swing, tell most. Where the search ran
-        out of rounds, the step that is left to the least cost counts as an error too.
+        plain sandwich is too small where a few blocks, such as the first swing, tell most. The step that is left to
+        the least cost counts as an error too.
 
         Args:
             blocks: Indices of residuals.
@@ -95,13 +97,22 @@ class Solution:
         without = [np.eye(len(inverse)) - J[b].T @ (w[b, None] * J[b]) @ inverse for b in blocks]
         scores = np.array([np.linalg.solve(a, J[b].T @ (w * r)[b]) for a, b in zip(without, blocks, strict=True)])
         sandwich = inverse @ (scores.T @ scores + np.diag(1.0 / self.prior**2)) @ inverse
-        away = (self.x - self.space.mean)[self.free] / self.prior**2
-        left = (not self.converged) * (inverse @ (J.T @ (w * r) + away))
-        return np.hypot(np.sqrt(np.maximum(np.diag(inverse) * max(chi, 1.0), np.diag(sandwich))), left)
+        x, low, high, mean = (a[self.free] for a in (self.x, self.space.low, self.space.high, self.space.mean))
+        slope = J.T @ (w * r) + (x - mean) / self.prior**2
+        slope[np.where(slope > 0.0, x - low, high - x) < AT_END] = 0.0  # it cannot go on
+        spread = np.sqrt(np.maximum(np.diag(inverse) * max(chi, 1.0), np.diag(sandwich)))
+        return np.hypot(spread, inverse @ slope)
 
 
 def minimise(
-    residuals: Residuals, space: Space, start: Array, free: Sequence[str], *, rounds: int, lasting: Sequence[str] = ()
+    residuals: Residuals,
+    space: Space,
+    start: Array,
+    free: Sequence[str],
+    *,
+    rounds: int,
+    lasting: Sequence[str] = (),
+    tolerance: float = TOLERANCE,
 ) -> Solution:
     """Find the parameters of least residuals near a start.
 
@@ -112,6 +123,7 @@ def minimise(
         free: Which of them may change.
         rounds: Jacobians at most.
         lasting: Those whose derivatives hardly change: they are kept for `KEPT` Jacobians.
+        tolerance: Relative change of the cost, and of the parameters' norm, at which it ends.
     """
     which = space.index(*free)
     prior, mean = space.prior[which], space.mean[which]
@@ -142,7 +154,7 @@ def minimise(
     latest: list[Array] = []
     lasts = np.isin(np.array(free), lasting)
     low, high, scale = space.low[which], space.high[which], np.where(np.isfinite(prior), prior, 1.0)
-    how: dict[str, Any] = {"loss": "huber", "f_scale": HUBER, "ftol": TOLERANCE, "xtol": TOLERANCE, "max_nfev": rounds}
+    how: dict[str, Any] = {"loss": "huber", "f_scale": HUBER, "ftol": tolerance, "xtol": tolerance, "max_nfev": rounds}
     begin = np.clip(start[which], low + 1e-9, high - 1e-9)
     how |= {"jac": lambda y: batch(y)[1], "bounds": (low, high), "x_scale": scale}
     found = least_squares(lambda y: batch(y)[0], begin, **how)
