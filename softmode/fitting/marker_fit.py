@@ -28,6 +28,8 @@ PLACE = 0.02
 """Standard deviation of ln E for where the markers and the clamp are: 3 mm of overhang of 100 are 4.5 % of E."""
 STEP = 1.0 / 400.0
 """Step of the worlds [s]."""
+LITTLE = 1.0e-5
+"""Relative change of the cost, and of the parameters' norm, at which the search ends."""
 LOADED = 24
 """Surface samples that a load is spread over."""
 
@@ -162,7 +164,7 @@ class MarkerFit:
         starts[:, 0] = np.log(SPECIFIC * self.material.density)
         costs = cost_of(residuals(starts))
         best = min(
-            (minimise(residuals, space, starts[k], names, rounds=12) for k in np.argsort(costs)[:2]),
+            (minimise(residuals, space, starts[k], names, rounds=30, tolerance=LITTLE) for k in np.argsort(costs)[:2]),
             key=lambda one: one.cost,
         )
         blocks = np.array_split(np.arange(len(best.residuals)).reshape(len(frames), -1), 12)
