@@ -11,16 +11,13 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 Array = NDArray[np.float64]
-Residuals = Callable[[Array], Array]
+Names = Sequence[str]
+Batch = Callable[[Array], Array]
 """From parameters (W, p) to residuals in units of their noise (W, M)."""
 KEPT = 3
 """Jacobians for which lasting derivatives are kept."""
 HUBER = 2.5
 """Residuals beyond this count by their size and not by its square."""
-TOLERANCE = 1.0e-3
-"""Relative change of the cost, and of the parameters' norm, at which a search ends: of ln E it is about 1 %."""
-AT_END = 0.01
-"""Distance from its least or largest value at which a parameter has come to it."""
 
 _FIELDS = ("mean", "prior", "step", "low", "high")
 
@@ -76,6 +73,8 @@ class Solution:
     """Their derivatives by the free parameters (M, k)."""
     prior: Array
     """Standard deviations of the priors of the free parameters (k,)."""
+    slope: Array
+    """Derivatives of the cost by them, 0 where one has come to its least or largest value (k,)."""
 
     def deviations(self, blocks: Sequence[NDArray[np.intp]]) -> Array:
         """Return standard deviations of the free parameters, (k,).
@@ -97,22 +96,12 @@ class Solution:
         without = [np.eye(len(inverse)) - J[b].T @ (w[b, None] * J[b]) @ inverse for b in blocks]
         scores = np.array([np.linalg.solve(a, J[b].T @ (w * r)[b]) for a, b in zip(without, blocks, strict=True)])
         sandwich = inverse @ (scores.T @ scores + np.diag(1.0 / self.prior**2)) @ inverse
-        x, low, high, mean = (a[self.free] for a in (self.x, self.space.low, self.space.high, self.space.mean))
-        slope = J.T @ (w * r) + (x - mean) / self.prior**2
-        slope[np.where(slope > 0.0, x - low, high - x) < AT_END] = 0.0  # it cannot go on
         spread = np.sqrt(np.maximum(np.diag(inverse) * max(chi, 1.0), np.diag(sandwich)))
-        return np.hypot(spread, inverse @ slope)
+        return np.hypot(spread, inverse @ self.slope)
 
 
 def minimise(
-    residuals: Residuals,
-    space: Space,
-    start: Array,
-    free: Sequence[str],
-    *,
-    rounds: int,
-    lasting: Sequence[str] = (),
-    tolerance: float = TOLERANCE,
+    residuals: Batch, space: Space, start: Array, free: Names, *, rounds: int, kept: Names = (), tolerance: float = 1e-3
 ) -> Solution:
     """Find the parameters of least residuals near a start.
 
@@ -122,8 +111,8 @@ def minimise(
         start: Where to begin (p,).
         free: Which of them may change.
         rounds: Jacobians at most.
-        lasting: Those whose derivatives hardly change: they are kept for `KEPT` Jacobians.
-        tolerance: Relative change of the cost, and of the parameters' norm, at which it ends.
+        kept: Those whose derivatives hardly change: they are kept for `KEPT` Jacobians.
+        tolerance: Relative change of the cost, and of the parameters' norm, at which it ends; 1e-3 is 1 % of E.
     """
     which = space.index(*free)
     prior, mean = space.prior[which], space.mean[which]
@@ -152,7 +141,7 @@ def minimise(
 
     counted: list[int] = []
     latest: list[Array] = []
-    lasts = np.isin(np.array(free), lasting)
+    lasts = np.isin(np.array(free), kept)
     low, high, scale = space.low[which], space.high[which], np.where(np.isfinite(prior), prior, 1.0)
     how: dict[str, Any] = {"loss": "huber", "f_scale": HUBER, "ftol": tolerance, "xtol": tolerance, "max_nfev": rounds}
     begin = np.clip(start[which], low + 1e-9, high - 1e-9)
@@ -163,6 +152,7 @@ def minimise(
     x[which] = found.x
     m = len(r) - len(which)
     told: dict[str, Any] = {"converged": found.status > 0, "cost": float(found.cost)}
+    told["slope"] = np.where(found.active_mask, 0.0, found.grad)
     return Solution(space=space, x=x, free=which, residuals=r[:m], jacobian=J[:m], prior=prior, **told)
 
 
