@@ -28,8 +28,6 @@ PLACE = 0.02
 """Standard deviation of ln E for where the markers and the clamp are: 3 mm of overhang of 100 are 4.5 % of E."""
 STEP = 1.0 / 400.0
 """Step of the worlds [s]."""
-LITTLE = 1.0e-5
-"""Relative change of the cost, and of the parameters' norm, at which the search ends."""
 LOADED = 24
 """Surface samples that a load is spread over."""
 
@@ -151,8 +149,7 @@ class MarkerFit:
         frames = np.arange(markers.release, last + 1)
         times, noise = markers.times[frames], max(markers.noise, 2.0e-4)
         worlds = self._worlds(5 + len(free), STEP)
-        interval = float(np.median(np.diff(markers.times)))
-        start = (release, 2.0 * interval, 0.002, release - 0.05, release + 0.05)
+        start = (release, 2.0 * float(np.median(np.diff(markers.times))), 0.002, release - 0.05, release + 0.05)
         space = Space.of({**physics_rows(self.material), "start": start})
         names = [name for name in space.names if name not in FREE or name in free]
 
@@ -164,7 +161,7 @@ class MarkerFit:
         starts[:, 0] = np.log(SPECIFIC * self.material.density)
         costs = cost_of(residuals(starts))
         best = min(
-            (minimise(residuals, space, starts[k], names, rounds=30, tolerance=LITTLE) for k in np.argsort(costs)[:2]),
+            (minimise(residuals, space, starts[k], names, rounds=30, tolerance=1e-5) for k in np.argsort(costs)[:2]),
             key=lambda one: one.cost,
         )
         blocks = np.array_split(np.arange(len(best.residuals)).reshape(len(frames), -1), 12)
