@@ -161,7 +161,7 @@ class MarkerFit:
         starts[:, 0] = np.log(SPECIFIC * self.material.density)
         costs = cost_of(residuals(starts))
         best = min(
-            (minimise(residuals, space, starts[k], names, rounds=30, tolerance=1e-5) for k in np.argsort(costs)[:2]),
+            (minimise(residuals, space, starts[k], names, rounds=30, tolerance=1e-4) for k in np.argsort(costs)[:2]),
             key=lambda one: one.cost,
         )
         blocks = np.array_split(np.arange(len(best.residuals)).reshape(len(frames), -1), 12)
