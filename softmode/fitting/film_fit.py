@@ -133,7 +133,7 @@ def fit_film(
 
     def refined(space: Space, start: Array, names: Sequence[str]) -> Array:
         """Return the cost and the parameters near a start."""
-        one = minimise(residuals, space, start, names, rounds=4, lasting=_LASTING)
+        one = minimise(residuals, space, start, names, rounds=4, kept=_LASTING)
         return np.append(one.cost, one.x)
 
     found: list[Array] = []
@@ -147,7 +147,7 @@ def fit_film(
     x = kept("coverage", functools.partial(refined, space, x, names))[1:]
     tell("fitting with tracks", 0.8)
     residuals.anchor(tracks, x)
-    best = minimise(residuals, space, x, names, rounds=6, lasting=_LASTING)
+    best = minimise(residuals, space, x, names, rounds=6, kept=_LASTING)
     cover = best.residuals[: residuals.sizes[0]]
     followed = _followed(cover.reshape(len(every), -1), unmoved)
     if followed < FOLLOWED and np.sqrt((cover**2).mean()) > LEFT:

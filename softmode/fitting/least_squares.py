@@ -11,14 +11,13 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 Array = NDArray[np.float64]
-Residuals = Callable[[Array], Array]
+Names = Sequence[str]
+Batch = Callable[[Array], Array]
 """From parameters (W, p) to residuals in units of their noise (W, M)."""
 KEPT = 3
 """Jacobians for which lasting derivatives are kept."""
 HUBER = 2.5
 """Residuals beyond this count by their size and not by its square."""
-TOLERANCE = 1.0e-3
-"""Relative change of the cost, and of the parameters in their priors, at which it ends."""
 
 _FIELDS = ("mean", "prior", "step", "low", "high")
 
@@ -74,14 +73,16 @@ class Solution:
     """Their derivatives by the free parameters (M, k)."""
     prior: Array
     """Standard deviations of the priors of the free parameters (k,)."""
+    slope: Array
+    """Derivatives of the cost by them, 0 where one has come to its least or largest value (k,)."""
 
     def deviations(self, blocks: Sequence[NDArray[np.intp]]) -> Array:
         """Return standard deviations of the free parameters, (k,).
 
         Of two the larger: that of Gauss and Newton with the priors, times chi where it is above one, and the jackknife
         over blocks of residuals that may err together (MacKinnon and White 1985, doi:10.1016/0304-4076(85)90158-7): a
-        plain sandwich is too small where a few blocks, such as the first swing, tell most. Where the search ran
-        out of rounds, the step that is left to the least cost counts as an error too.
+        plain sandwich is too small where a few blocks, such as the first swing, tell most. The step that is left to
+        the least cost counts as an error too.
 
         Args:
             blocks: Indices of residuals.
@@ -95,13 +96,12 @@ class Solution:
         without = [np.eye(len(inverse)) - J[b].T @ (w[b, None] * J[b]) @ inverse for b in blocks]
         scores = np.array([np.linalg.solve(a, J[b].T @ (w * r)[b]) for a, b in zip(without, blocks, strict=True)])
         sandwich = inverse @ (scores.T @ scores + np.diag(1.0 / self.prior**2)) @ inverse
-        away = (self.x - self.space.mean)[self.free] / self.prior**2
-        left = (not self.converged) * (inverse @ (J.T @ (w * r) + away))
-        return np.hypot(np.sqrt(np.maximum(np.diag(inverse) * max(chi, 1.0), np.diag(sandwich))), left)
+        spread = np.sqrt(np.maximum(np.diag(inverse) * max(chi, 1.0), np.diag(sandwich)))
+        return np.hypot(spread, inverse @ self.slope)
 
 
 def minimise(
-    residuals: Residuals, space: Space, start: Array, free: Sequence[str], *, rounds: int, lasting: Sequence[str] = ()
+    residuals: Batch, space: Space, start: Array, free: Names, *, rounds: int, kept: Names = (), tolerance: float = 1e-3
 ) -> Solution:
     """Find the parameters of least residuals near a start.
 
@@ -111,7 +111,8 @@ def minimise(
         start: Where to begin (p,).
         free: Which of them may change.
         rounds: Jacobians at most.
-        lasting: Those whose derivatives hardly change: they are kept for `KEPT` Jacobians.
+        kept: Those whose derivatives hardly change: they are kept for `KEPT` Jacobians.
+        tolerance: Relative change of the cost, and of the parameters' norm, at which it ends; 1e-3 is 1 % of E.
     """
     which = space.index(*free)
     prior, mean = space.prior[which], space.mean[which]
@@ -140,9 +141,9 @@ def minimise(
 
     counted: list[int] = []
     latest: list[Array] = []
-    lasts = np.isin(np.array(free), lasting)
+    lasts = np.isin(np.array(free), kept)
     low, high, scale = space.low[which], space.high[which], np.where(np.isfinite(prior), prior, 1.0)
-    how: dict[str, Any] = {"loss": "huber", "f_scale": HUBER, "ftol": TOLERANCE, "xtol": TOLERANCE, "max_nfev": rounds}
+    how: dict[str, Any] = {"loss": "huber", "f_scale": HUBER, "ftol": tolerance, "xtol": tolerance, "max_nfev": rounds}
     begin = np.clip(start[which], low + 1e-9, high - 1e-9)
     how |= {"jac": lambda y: batch(y)[1], "bounds": (low, high), "x_scale": scale}
     found = least_squares(lambda y: batch(y)[0], begin, **how)
@@ -151,6 +152,7 @@ def minimise(
     x[which] = found.x
     m = len(r) - len(which)
     told: dict[str, Any] = {"converged": found.status > 0, "cost": float(found.cost)}
+    told["slope"] = np.where(found.active_mask, 0.0, found.grad)
     return Solution(space=space, x=x, free=which, residuals=r[:m], jacobian=J[:m], prior=prior, **told)
 
 

@@ -149,8 +149,7 @@ class MarkerFit:
         frames = np.arange(markers.release, last + 1)
         times, noise = markers.times[frames], max(markers.noise, 2.0e-4)
         worlds = self._worlds(5 + len(free), STEP)
-        interval = float(np.median(np.diff(markers.times)))
-        start = (release, 2.0 * interval, 0.002, release - 0.05, release + 0.05)
+        start = (release, 2.0 * float(np.median(np.diff(markers.times))), 0.002, release - 0.05, release + 0.05)
         space = Space.of({**physics_rows(self.material), "start": start})
         names = [name for name in space.names if name not in FREE or name in free]
 
@@ -162,7 +161,7 @@ class MarkerFit:
         starts[:, 0] = np.log(SPECIFIC * self.material.density)
         costs = cost_of(residuals(starts))
         best = min(
-            (minimise(residuals, space, starts[k], names, rounds=12) for k in np.argsort(costs)[:2]),
+            (minimise(residuals, space, starts[k], names, rounds=30, tolerance=1e-4) for k in np.argsort(costs)[:2]),
             key=lambda one: one.cost,
         )
         blocks = np.array_split(np.arange(len(best.residuals)).reshape(len(frames), -1), 12)
