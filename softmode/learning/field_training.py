@@ -53,6 +53,7 @@ the backdrop stands before it."""
 def train_field(
     pictures: Sequence[PosedPicture],
     *,
+    wall: Sequence[float] = (1.0, 1.0, 1.0),
     steps: int = 1500,
     seed: int = 0,
     metres: float | None = None,
@@ -83,15 +84,16 @@ def train_field(
     torch.manual_seed(seed)
     images = np.stack([picture.pixels()[..., :3] for picture in pictures])
     border = np.concatenate([images[:, :3].reshape(len(images), -1, 3), images[:, -3:].reshape(len(images), -1, 3)], 1)
-    wall = np.median(border, axis=1).astype(np.float64)
+    back = np.median(border, axis=1).astype(np.float64)
     middle, half = _cube(pictures)
-    carved = _hull(pictures, images, wall, middle, half)
+    carved = _hull(pictures, images, back, middle, half)
     if not carved.any():
         raise AssetError("the silhouettes have nothing in common", hint="check poses, lens and that the wall is plain")
     switch, fresh = int(SWITCH * steps), 0
     foggy = switch >= FIRST
     walls = Walls(_distance(carved), np.zeros((*carved.shape, 3)), fog=foggy)
-    gain = torch.tensor(np.log(wall.mean(axis=1)), dtype=torch.float32, requires_grad=True)
+    plain = torch.tensor(wall, dtype=torch.float32)
+    gain = torch.tensor(np.log(back.sum(axis=1) / sum(wall)), dtype=torch.float32, requires_grad=True)
     exposures = torch.optim.Adam([gain], lr=RATES[2])
     eyes = torch.tensor(np.array([p.camera.position for p in pictures]) - middle + half, dtype=torch.float32)
     ways = torch.tensor(np.stack([p.rays() for p in pictures]).reshape(-1, 3), dtype=torch.float32)
@@ -118,7 +120,7 @@ def train_field(
         voxel, of = 2.0 * half / (walls.n - 1), ray // each
         near, far = first[ray] / voxel, last[ray] / voxel
         color, left = walls.march(eyes[of] / voxel, ways[ray], near, far, min(0.7, 1.2 * beta), beta)
-        seen = torch.exp(gain)[of, None] * (color + left[:, None])
+        seen = torch.exp(gain)[of, None] * (color + left[:, None] * plain)
         error = ((torch.minimum(seen, 1.0 + 0.01 * (seen - 1.0)) - target[ray]) ** 2).mean()  # cut at white
         for optimiser in (walls.optimiser, exposures):
             optimiser.zero_grad()
@@ -150,13 +152,13 @@ def _cube(pictures: Sequence[PosedPicture]) -> tuple[Array, float]:
 
 
 def _hull(
-    pictures: Sequence[PosedPicture], images: NDArray[np.float32], wall: Array, middle: Array, half: float
+    pictures: Sequence[PosedPicture], images: NDArray[np.float32], walls: Array, middle: Array, half: float
 ) -> NDArray[np.bool_]:
     """Return the nodes of the coarse grid that half of the pictures see, and that lie in the silhouettes."""
     line = np.linspace(-half, half, COARSE)
     nodes = np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1) + middle
     beside, seen = np.zeros((COARSE,) * 3, int), np.zeros((COARSE,) * 3, int)
-    for picture, image, back in zip(pictures, images, wall, strict=True):
+    for picture, image, back in zip(pictures, images, walls, strict=True):
         apart: Any = np.abs(ndimage.gaussian_filter(image, (0.7, 0.7, 0.0)) - back).max(axis=-1) > CONTRAST
         front: Any = ndimage.binary_dilation(ndimage.binary_opening(ndimage.binary_fill_holes(apart)), iterations=SLACK)
         j, i = np.moveaxis(np.floor(picture.project(nodes)).astype(int), -1, 0)
