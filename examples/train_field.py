@@ -25,8 +25,7 @@ from softmode.scenes import SplatScene
 LENS, NOISE, BLUR, EXPOSURE = gs.Lens(k1=0.08, k2=-0.03, p1=0.001, p2=-0.0008), 0.02, 0.5, 0.1
 """What the lens does; noise of a pixel, blur [px], to which the lens adds as much, and error of the exposure."""
 FOAM = Material(youngs_modulus=2.0e4, poissons_ratio=0.35, density=150.0, viscosity=4.0e-3)
-WALL = (0.1, 0.9, 0.1)
-"""Colour of the wall, which no preset has."""
+WALL = (1.0, 1.0, 1.0)
 SKY = gs.CameraOptions(sky=(WALL,) * 2)
 
 
