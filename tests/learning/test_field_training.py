@@ -13,7 +13,7 @@ from softmode.radiance import RadianceGrid, render_radiance
 from softmode.splats import Lens, PinholeCamera, read_transforms, write_transforms
 
 torch = pytest.importorskip("torch")
-RADIUS, EDGE, WALL = 0.05, 40, (0.1, 0.9, 0.1)
+RADIUS, EDGE = 0.05, 40
 
 
 def ball(x):
@@ -23,7 +23,7 @@ def ball(x):
 
 
 def pictures(folder: Path, count: int) -> Path:
-    """Write pictures of the ball before green, of a lens and of wrong exposure; return their folder."""
+    """Write pictures of the ball before white, of a lens and of wrong exposure; return their folder."""
     field = RadianceGrid.from_function(ball, [[-0.06] * 3, [0.06] * 3], resolution=48)
     z = np.linspace(-0.7, 0.9, count)
     a, r = 2.4 * np.arange(count), np.sqrt(1.0 - z * z)
@@ -33,7 +33,7 @@ def pictures(folder: Path, count: int) -> Path:
         for i, eye in enumerate(eyes)
     ]
     poses, c = [camera.world_to_camera for camera in cameras], cameras[0]
-    seen = render_radiance(field, poses, (c.fx, c.fy, c.cx, c.cy), width=EDGE, height=EDGE).on(WALL)
+    seen = render_radiance(field, poses, (c.fx, c.fy, c.cx, c.cy), width=EDGE, height=EDGE).on((1.0, 1.0, 1.0))
     gains = np.linspace(0.9, 1.0, count)[:, None, None, None]
     write_transforms(folder, cameras, gains * np.asarray(seen), Lens(k1=0.05))
     return folder
@@ -47,11 +47,7 @@ def test_a_ball_is_a_ball(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
         monkeypatch.setattr(f"softmode.learning.field_training.{name}", value)
     told: list[float] = []
     found = train_field(
-        read_transforms(pictures(tmp_path, 10)),
-        wall=WALL,
-        steps=120,
-        metres=1.0,
-        progress=lambda _, error: told.append(error),
+        read_transforms(pictures(tmp_path, 10)), steps=120, metres=1.0, progress=lambda _, error: told.append(error)
     )
     assert np.mean(told[-5:]) < 0.2 * np.mean(told[:5])
     box = found.bounds + np.array([[-1.0], [1.0]]) * found.spacing
@@ -99,6 +95,6 @@ def test_silhouettes_without_anything_in_common(tmp_path: Path) -> None:
     with pytest.raises(AssetError, match="several sizes"):
         train_field(())
     with pytest.raises(AssetError, match="not the wall"):
-        train_field(read_transforms(tmp_path), wall=WALL)
+        train_field(read_transforms(tmp_path), wall=(0.1, 0.9, 0.1))
     with pytest.raises(ConfigError, match="wall is"):
         train_field(read_transforms(tmp_path), wall=(0.0, 0.0, 0.0))
