@@ -25,7 +25,8 @@ from softmode.scenes import SplatScene
 LENS, NOISE, BLUR, EXPOSURE = gs.Lens(k1=0.08, k2=-0.03, p1=0.001, p2=-0.0008), 0.02, 0.5, 0.1
 """What the lens does; noise of a pixel, blur [px], to which the lens adds as much, and error of the exposure."""
 FOAM = Material(youngs_modulus=2.0e4, poissons_ratio=0.35, density=150.0, viscosity=4.0e-3)
-WHITE = gs.CameraOptions(sky=((1.0, 1.0, 1.0),) * 2)
+WALL = (1.0, 1.0, 1.0)
+SKY = gs.CameraOptions(sky=(WALL,) * 2)
 
 
 def views(splats, count: int, lowest: float, turn: float, edge: int, fov: float) -> list[gs.PinholeCamera]:
@@ -40,12 +41,12 @@ def views(splats, count: int, lowest: float, turn: float, edge: int, fov: float)
 
 
 def pictures(splats, cameras: list[gs.PinholeCamera]) -> np.ndarray:
-    """Return clean pictures before white, shape (V, height, width, 3)."""
+    """Return clean pictures before the wall, shape (V, height, width, 3)."""
     first = cameras[0]
     raster = gs.SplatRasterizer(splats.count, len(cameras), first.width, first.height)
     seen = gs.ViewArrays.from_cameras(cameras, world=[0] * len(cameras))
     raster.render(gs.SplatArrays.from_splats([splats]), seen)
-    return raster.rgb.numpy() + 1.0 - raster.alpha.numpy()[..., None]
+    return raster.rgb.numpy() + (1.0 - raster.alpha.numpy()[..., None]) * np.array(WALL)
 
 
 def psnr(one: np.ndarray, other: np.ndarray) -> float:
@@ -59,7 +60,7 @@ def pulled(thing: SoftObject, edge: int) -> tuple[list[np.ndarray], list[float],
     size = {"target": (0.0, 0.0, 0.0), "width": edge, "height": edge, "fov_y": 0.62}
     camera = gs.PinholeCamera.look_at("film", position=(0.2, -0.26, 0.1), **size)
     still = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
-    scene = SplatScene(still, [Placed(object=thing)], cameras=[camera], camera_options=WHITE, grip_slots=24, march=True)
+    scene = SplatScene(still, [Placed(object=thing)], cameras=[camera], camera_options=SKY, grip_slots=24, march=True)
     points = thing.body.surface.points
     height = np.ptp(points[:, 2])
     order = np.argsort(points[:, 2])
@@ -100,11 +101,11 @@ def main() -> None:
     seen = seen * (1.0 + EXPOSURE * rng.uniform(-1.0, 1.0, (count, 1, 1, 1))) + NOISE * rng.normal(size=seen.shape)
     gs.write_transforms(given.folder, cameras, seen, LENS)
     clock = time.process_time()
-    field = train_field(gs.read_transforms(given.folder), steps=steps, metres=1.0)
+    field = train_field(gs.read_transforms(given.folder), wall=WALL, steps=steps, metres=1.0)
     print(f"trained {steps} steps on {count} pictures of {edge} px in {time.process_time() - clock:.0f} s of a core")
     write_radiance(given.folder / "field.npz", field)
     lens, poses = (held[0].fx, held[0].fy, held[0].cx, held[0].cy), [camera.world_to_camera for camera in held]
-    marched = render_radiance(field, poses, lens, width=edge, height=edge, samples=2).on((1.0, 1.0, 1.0))
+    marched = render_radiance(field, poses, lens, width=edge, height=edge, samples=2).on(WALL)
     decibels = psnr(marched, pictures(splats, held))
     thing = load(given.folder / "field.npz", pose="captured", material=FOAM, splat_count=2000)
     volume = thing.body.volume / toy.body.volume

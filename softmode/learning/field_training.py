@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from softmode.checks import require_number
-from softmode.errors import AssetError, needs_extra
+from softmode.errors import AssetError, ConfigError, needs_extra
 from softmode.radiance.grid import RadianceGrid
 from softmode.splats.raster.posed_pictures import PosedPicture
 from softmode.splats.splats import SH_DC
@@ -55,18 +55,20 @@ the backdrop stands before it."""
 def train_field(
     pictures: Sequence[PosedPicture],
     *,
+    wall: Sequence[float] = (1.0, 1.0, 1.0),
     steps: int = 1500,
     seed: int = 0,
     metres: float | None = None,
     progress: Callable[[int, float], None] | None = None,
 ) -> RadianceGrid:
-    """Train a field on pictures of an object before a white wall.
+    """Train a field on pictures of an object before a plain wall of a known colour.
 
     The exposure of each picture is found too. Colours do not depend on the direction. What no picture shows is filled.
     A cavity is empty as far as two pictures look into it.
 
     Args:
         pictures: The pictures; the border of each is the wall. The object is where their axes meet.
+        wall: Colour of the wall, sRGB 0..1. Where the object has it too, no picture says where its surface is.
         steps: Steps; 1,500 take two minutes on one core.
         seed: Seed of rays.
         metres: Metres of a unit of the poses, None if not known.
@@ -76,25 +78,33 @@ def train_field(
         The field, in the frame and unit of the poses, 192 nodes an edge less what is empty, of degree 0.
 
     Raises:
-        AssetError: If the pictures are of several sizes, or their silhouettes have nothing in common.
-        ConfigError: If the number of steps is not positive.
+        AssetError: If the pictures are of several sizes, their border is not the wall, or their silhouettes have
+            nothing in common.
+        ConfigError: If the number of steps is not positive, or the wall is no colour, or black.
     """
     require_number("steps", steps, at_least=1)
+    if len(wall) != 3 or not (min(wall) >= 0.0 and 0.0 < max(wall) <= 1.0):
+        raise ConfigError(f"wall is {wall}", hint="give the colour of the wall, three numbers 0..1, not black")
     if len({(p.camera.width, p.camera.height) for p in pictures}) != 1:
         raise AssetError("pictures of several sizes, or none", hint="give pictures of one size")
     torch.manual_seed(seed)
     images = np.stack([picture.pixels()[..., :3] for picture in pictures])
     border = np.concatenate([images[:, :3].reshape(len(images), -1, 3), images[:, -3:].reshape(len(images), -1, 3)], 1)
-    wall = np.median(border, axis=1).astype(np.float64)
+    back = np.median(border, axis=1).astype(np.float64)
+    exposures = back.sum(axis=1) / sum(wall)
+    if np.median(np.abs(back - exposures[:, None] * wall).max(axis=1)) > 0.1:
+        color = np.median(back, axis=0).round(2).tolist()
+        raise AssetError(f"the border of the pictures is {color}, not the wall", hint="give its colour as wall")
     middle, half = _cube(pictures)
-    carved = _hull(pictures, images, wall, middle, half)
+    carved = _hull(pictures, images, back, middle, half)
     if not carved.any():
         raise AssetError("the silhouettes have nothing in common", hint="check poses, lens and that the wall is plain")
     switch, fresh = int(SWITCH * steps), 0
     foggy = switch >= FIRST
     walls = Walls(_distance(carved), np.zeros((*carved.shape, 3)), fog=foggy)
-    gain = torch.tensor(np.log(wall.mean(axis=1)), dtype=torch.float32, requires_grad=True)
-    exposures = torch.optim.Adam([gain], lr=RATES[2])
+    plain = torch.tensor(wall, dtype=torch.float32)
+    gain = torch.tensor(np.log(exposures), dtype=torch.float32, requires_grad=True)
+    gains = torch.optim.Adam([gain], lr=RATES[2])
     eyes = torch.tensor(np.array([p.camera.position for p in pictures]) - middle + half, dtype=torch.float32)
     ways = torch.tensor(np.stack([p.rays() for p in pictures]).reshape(-1, 3), dtype=torch.float32)
     target, each = torch.tensor(images.reshape(-1, 3)), images[0, ..., 0].size
@@ -120,13 +130,13 @@ def train_field(
         voxel, of = 2.0 * half / (walls.n - 1), ray // each
         near, far = first[ray] / voxel, last[ray] / voxel
         color, left = walls.march(eyes[of] / voxel, ways[ray], near, far, min(0.7, 1.2 * beta), beta)
-        seen = torch.exp(gain)[of, None] * (color + left[:, None])
+        seen = torch.exp(gain)[of, None] * (color + left[:, None] * plain)
         error = ((torch.minimum(seen, 1.0 + 0.01 * (seen - 1.0)) - target[ray]) ** 2).mean()  # cut at white
-        for optimiser in (walls.optimiser, exposures):
+        for optimiser in (walls.optimiser, gains):
             optimiser.zero_grad()
         more = walls.roughness(0.0) + EMPTY * walls.matter() if foggy else walls.roughness(EIKONAL)
         (error + more).backward()
-        for optimiser in (walls.optimiser, exposures):
+        for optimiser in (walls.optimiser, gains):
             optimiser.step()
         if progress is not None:
             progress(step + 1, error.item())
@@ -152,13 +162,13 @@ def _cube(pictures: Sequence[PosedPicture]) -> tuple[Array, float]:
 
 
 def _hull(
-    pictures: Sequence[PosedPicture], images: NDArray[np.float32], wall: Array, middle: Array, half: float
+    pictures: Sequence[PosedPicture], images: NDArray[np.float32], walls: Array, middle: Array, half: float
 ) -> NDArray[np.bool_]:
     """Return the nodes of the coarse grid that half of the pictures see, and that lie in the silhouettes."""
     line = np.linspace(-half, half, COARSE)
     nodes = np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1) + middle
     beside, seen = np.zeros((COARSE,) * 3, int), np.zeros((COARSE,) * 3, int)
-    for picture, image, back in zip(pictures, images, wall, strict=True):
+    for picture, image, back in zip(pictures, images, walls, strict=True):
         apart: Any = np.abs(ndimage.gaussian_filter(image, (0.7, 0.7, 0.0)) - back).max(axis=-1) > CONTRAST
         front: Any = ndimage.binary_dilation(ndimage.binary_opening(ndimage.binary_fill_holes(apart)), iterations=SLACK)
         j, i = np.moveaxis(np.floor(picture.project(nodes)).astype(int), -1, 0)
@@ -242,7 +252,7 @@ class Walls:
         found: Any = ndimage.label(s < 0.0)
         parts, count = found
         if not count:
-            raise AssetError("nothing is left of the object", hint="check exposure, poses, and that the wall is white")
+            raise AssetError("nothing is left of the object", hint="check exposure, poses, and the colour of the wall")
         full = parts == 1 + np.argmax(np.bincount(parts.ravel())[1:])
         far = _distance(full)
         s = np.where((np.abs(s) < 1.5 * zoom) & (np.abs(far) < 2.5), np.sign(far) * np.abs(s), far)

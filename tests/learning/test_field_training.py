@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from softmode.deformables import quadrature_from_density
-from softmode.errors import AssetError
+from softmode.errors import AssetError, ConfigError
 from softmode.radiance import RadianceGrid, render_radiance
 from softmode.splats import Lens, PinholeCamera, read_transforms, write_transforms
 
@@ -84,7 +84,7 @@ def test_what_light_reaches_is_empty() -> None:
 
 
 def test_silhouettes_without_anything_in_common(tmp_path: Path) -> None:
-    """Pictures of a wall alone, or of several sizes, are refused."""
+    """Pictures of a wall alone, of another than is stated, or of several sizes are refused."""
     from softmode.learning import train_field
 
     cameras = [PinholeCamera.look_at(f"{i}", position=(0.3, 0.1 * i, 0.1), target=(0.0, 0.0, 0.0), width=16, height=16)
@@ -94,3 +94,7 @@ def test_silhouettes_without_anything_in_common(tmp_path: Path) -> None:
         train_field(read_transforms(tmp_path), steps=1)
     with pytest.raises(AssetError, match="several sizes"):
         train_field(())
+    with pytest.raises(AssetError, match="not the wall"):
+        train_field(read_transforms(tmp_path), wall=(0.1, 0.9, 0.1))
+    with pytest.raises(ConfigError, match="wall is"):
+        train_field(read_transforms(tmp_path), wall=(0.0, 0.0, 0.0))
