@@ -117,10 +117,12 @@ class Fit:
             free=self.free or None,
         )
         with quiet_warp():
+            refused = out.with_suffix(".refused.png")
             try:
                 found, free, film = self._fitted(scene)
             except FitError as error:
-                raise _shown(error, out.with_suffix(".refused.png")) from error
+                raise _shown(error, refused) from error
+            refused.unlink(missing_ok=True)  # that of an earlier run
             found.write(out.with_name("fit.json"))
             for line in found.lines():
                 print(line)
@@ -159,6 +161,8 @@ class Fit:
             _refuse(self, ("fov",), "a film without --camera")
         if self.press is None:
             _refuse(self, ("radius",), "jaws")
+        if (forces or table) and scene.exposure:
+            raise ConfigError(f"exposure says nothing about {what}", hint="leave it out of the scene")
         if forces and scene.free:
             raise ConfigError("free says nothing about a force log", hint="leave it out: forces show one number, E")
         scene.check_kind(what, "between" if forces and self.between else "press" if forces else "held")

@@ -271,6 +271,7 @@ class Task:
         (x, y), (dx, dy) = scene.object_position, config.position_range
         material = scene.material
         least, most = scene.control.workspace_lower, scene.control.workspace_upper
+        varied = any(len(thing.body.cubature.lame_ratio) for thing in self.scene.occupancy.choices)
 
         def ranged(name: str, least: float, most: float, *, log: bool = False) -> Parameter:
             given = getattr(config, f"{name}_range")
@@ -283,7 +284,7 @@ class Task:
                 name="yaw", low=(-config.yaw_range,), high=(config.yaw_range,), least=(-math.tau,), most=(math.tau,)
             ),
             ranged("youngs_modulus", 1.0e2, 1.0e11, log=True),
-            ranged("poissons_ratio", -0.9, 0.49),
+            ranged("poissons_ratio", 0.0 if varied else -0.9, 0.49),  # lambda / mu of a field keeps its proportions
             ranged("density", 10.0, 2.0e4, log=True),
             ranged("friction", 0.0, 10.0),
             ranged("scale", 0.5, 2.0),
