@@ -53,8 +53,9 @@ ROOMS = {
 }
 """The cheapest example of each room, which every test run plays; the others play with the rest."""
 
-SLOW = {"train_own_toy"}
-"""It checks, trains, evaluates and films by four commands, as test_cli_objects.py does one at a time: 80 s."""
+SLOW = {"train_own_toy", "plinko"}
+"""One checks, trains, evaluates and films by four commands, as test_cli_objects.py does one at a time: 80 s. The other
+has eighteen toys where `toys_in_container` has thirteen."""
 
 
 def test_there_are_examples():
