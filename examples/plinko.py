@@ -27,8 +27,8 @@ WALLS, BETWEEN = (-0.15, 0.0, 0.15), (-0.225, -0.075, 0.075, 0.225)
 PEGS = np.array([(x, 0.32 + 0.12 * row) for row in range(4) for x in (WALLS if row % 2 else BETWEEN)])  # x, z [m].
 SMALL = {"cable": 0.04, "doughnut": 0.06, "ball": 0.055, "block-a": 0.045, "block-b": 0.045, "block-c": 0.045}  # [m].
 BUILD, SAMPLES, SIZE = BuildOptions(mode_count=5, cubature_count=192), 300, 0.065
-TOYS = [(name, SMALL.get(name, SIZE), 1.0) for name in PRESETS]
-TOYS += [("bear", 0.055, 4.0), ("doughnut", 0.05, 8.0), ("cushion", 0.055, 3.0)]  # Edge [m], stiffness over its own.
+MORE = [("bear", 0.055, 4.0), ("doughnut", 0.05, 8.0), ("cushion", 0.055, 3.0)]  # Edge [m], stiffness over its own.
+TOYS = [*((name, SMALL.get(name, SIZE), 1.0) for name in PRESETS), *MORE]
 PLUSH = Material(youngs_modulus=5.0e4, poissons_ratio=0.35, density=150.0)  # What captures are made of.
 
 
