@@ -420,7 +420,8 @@ def test_a_stroke_of_the_mouse_cuts(tmp_path: Path) -> None:
         start, end = centre - np.array([0.2 * size, 0.2 * size, 0.0]), centre + np.array([0.3 * size, -0.2 * size, 0.0])
         for phase, at in (("start", start), ("update", end)):
             client.send(drag_message(phase, start, at))
-        assert view.wait(lambda session: view.app._stage.stroke is not None) and view.app._stage._line.visible
+        stage = view.app._stage
+        assert view.wait(lambda session: stage.stroke is not None and stage._line.visible)  # of the second message
         client.send(drag_message("end", start, end))
         assert view.wait(lambda session: len(session.objects) == 2, 60.0)
         assert view.app._stage.stroke is None
