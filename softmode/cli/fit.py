@@ -149,13 +149,12 @@ class Fit:
         table = self.file.suffix.lower() == ".csv"
         forces = table and holds_forces(self.file)
         film, pressed = ("camera", "fov", "plate", "fps_true", "exposure"), ("press", "radius", "between")
-        what, silent = (
-            ("a force log", ("held", *film))
-            if forces
-            else ("markers", (*pressed, *film))
-            if table
-            else ("a film", pressed)
-        )
+        if forces:
+            what, silent = "a force log", ("held", *film)
+        elif table:
+            what, silent = "markers", (*pressed, *film)
+        else:
+            what, silent = "a film", pressed
         _refuse(self, silent, what)
         if self.camera is None:
             _refuse(self, ("fov",), "a film without --camera")

@@ -93,7 +93,7 @@ def fit_film(
     tracks = follow(clip, mattes.cover)
     placed = replace(camera, position=tuple(np.subtract(camera.position, thing.body.offset).tolist()))
     names = [name for name in NAMES if name not in FREE or name in free]
-    more = len(names) - len(NAMES) + len(FREE)
+    more = sum(name in FREE for name in names)
     residuals = FilmResiduals(thing, material, clip, mattes, placed, exposure=exposure, free=more, device=device)
     residuals.after = lambda: tell(done[0], min(done[1] + 0.01, 0.99))
     every, release = residuals.frames, float(clip.times[mattes.release])

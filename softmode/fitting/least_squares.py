@@ -145,8 +145,7 @@ def minimise(
     low, high, scale = space.low[which], space.high[which], np.where(np.isfinite(prior), prior, 1.0)
     how: dict[str, Any] = {"loss": "huber", "f_scale": HUBER, "ftol": tolerance, "xtol": tolerance, "max_nfev": rounds}
     begin = np.clip(start[which], low + 1e-9, high - 1e-9)
-    how |= {"jac": lambda y: batch(y)[1], "bounds": (low, high), "x_scale": scale}
-    found = least_squares(lambda y: batch(y)[0], begin, **how)
+    found = least_squares(lambda y: batch(y)[0], begin, lambda y: batch(y)[1], (low, high), x_scale=scale, **how)  # type: ignore[arg-type]
     r, J = batch(found.x)
     x = start.copy()
     x[which] = found.x

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from softmode.deformables.reduction.build_body import require_ratios
 from softmode.errors import AssetError, MaterialError
 from softmode.files import UNPACKED_FREE, damage_errors, read_arrays
 from softmode.foreign import process, tokens
+from softmode.objects.fingerprint import file_fingerprint
 from softmode.splats.formats.usd import UP_AXES
 from softmode.splats.splats import up_rotation
 
@@ -74,7 +75,7 @@ class MaterialField:
         """The means over the points: what the body as a whole is said to be made of, as fields of `Material`."""
         return {name: float(values.mean()) for name, values in self.values.items()}
 
-    @cached_property
+    @functools.cached_property
     def _tree(self) -> KDTree:
         return KDTree(self.points)
 
@@ -114,6 +115,12 @@ def read_material(path: str | os.PathLike[str]) -> MaterialField:
         AssetError: If the file is missing or damaged, or holds no points.
         MaterialError: If its arrays do not fit, or a value lies outside its range.
     """
+    return _read(path, file_fingerprint(Path(path)))
+
+
+@functools.lru_cache(maxsize=8)
+def _read(path: str | os.PathLike[str], _fingerprint: str) -> MaterialField:
+    """Read a file of a content: an object is built, dressed and weighed with the same field."""
     name = f"material {path}"
     if os.fspath(path).lower().endswith(tokens.SUFFIXES):
         arrays = _stage_arrays(Path(path), name)

@@ -23,6 +23,7 @@ from softmode.usd.writer import float_array, new_layer, new_stage, prim_name, sa
 
 _SAVE_BYTES = 64e6
 """After so many bytes of samples the layer is saved, which takes them out of memory."""
+Shown = Literal["splats", "points", "mesh"]
 MOST_NODES = 3.0e8
 """Of the grid that a mesh is found on: some 5 GB."""
 
@@ -33,7 +34,7 @@ def write_splat_animation(
     *,
     fps: float = 30.0,
     name: str = "splats",
-    shown: Literal["splats", "points", "mesh"] = "splats",
+    shown: Shown = "splats",
 ) -> int:
     """Write splats that move, change and take other colours as a stage; it appears complete or not at all.
 
@@ -55,7 +56,7 @@ def write_splat_animation(
         StorageError: If the file cannot be written.
         MissingExtraError: If the extra `[usd]` is not installed.
     """
-    require_choice("shown", shown, get_args(Literal["splats", "points", "mesh"]))
+    require_choice("shown", shown, get_args(Shown))
     target = check_stage(path)
     UsdGeom, UsdVol = openusd("UsdGeom", "UsdVol")
     with contextlib.suppress(OSError):  # what is in the way will be told by the next line
@@ -132,6 +133,6 @@ def _set_surface(mesh: Any, splats: Splats, cell: float, time: int) -> int:
     mesh.CreatePointsAttr().Set(places, time)
     mesh.CreateExtentAttr().Set(UsdGeom.PointBased.ComputeExtent(places), time)
     mesh.CreateFaceVertexCountsAttr().Set(Vt.IntArray.FromNumpy(np.full(len(faces), 3, np.int32)), time)
-    mesh.CreateFaceVertexIndicesAttr().Set(Vt.IntArray.FromNumpy(faces.astype(np.int32).ravel()), time)
+    mesh.CreateFaceVertexIndicesAttr().Set(Vt.IntArray.FromNumpy(faces.ravel()), time)
     mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(vectors(colors), time)
     return 24 * len(points) + 16 * len(faces)

@@ -228,7 +228,7 @@ def _ground(domain: Domain, options: BuildOptions) -> _Ground:
     plain = kernels.evaluate(domain.points)
     shape, blend, blend_slope = enveloped(plain, envelope)
     springs, pull = _springs(kernels, envelope, domain)
-    mu, lame = lame_parameters(float(np.mean(options.poissons_ratios)))
+    mu, lame = lame_parameters(options.mean_ratio)
     scalar = 1.0 / (lame + 4.0 * mu)
     return _Ground(
         kernels=kernels,
@@ -524,7 +524,7 @@ def _weights(
             shape,
             domain.volumes,
             density=domain.density,
-            poissons_ratio=float(np.mean(options.poissons_ratios)),
+            poissons_ratio=options.mean_ratio,
             stiffness_scale=domain.stiffness,
             lame_ratio=domain.lame_ratio,
             springs=springs,

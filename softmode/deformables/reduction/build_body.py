@@ -156,7 +156,7 @@ def _build(
     )
     pieces = pieces_near(quadrature, regions)
     places, weights = pieces.points, pieces.weights
-    reference = float(np.mean(options.poissons_ratios))
+    reference = options.mean_ratio
     shear, lame_ratio, scalar = _relative_moduli(stiffness, ratio, reference)
     stiffness, density = stiffness[pieces.parent], density[pieces.parent]
     density = density * (quadrature.volume / (weights @ density))
@@ -341,7 +341,7 @@ def _cubature(
             count,
             stiffness_scale=stiffness,
             lame_ratio=lame_ratio,
-            poissons_ratio=POISSON_RATIO if lame_ratio is None else float(np.mean(options.poissons_ratios)),
+            poissons_ratio=POISSON_RATIO if lame_ratio is None else options.mean_ratio,
             driven_count=basis.functions.driven_count,
             pose_count=poses,
             seed=options.seed,

@@ -257,12 +257,9 @@ class _Sampler:
     def __init__(self, gradient: Real, weights: Real, poissons_ratio: float, lame_ratio: Array | None) -> None:
         self.gradient = np.ascontiguousarray(gradient).reshape(len(gradient), -1)  # (n, 3 P)
         self.weights, self.poissons_ratio, self.lame_ratio = weights, poissons_ratio, lame_ratio
-
-    @property
-    def law(self) -> tuple[float, float | Real]:
+        mu, lame = lame_parameters(poissons_ratio)
+        self.law = (mu, lame if lame_ratio is None else (lame * lame_ratio).astype(self.gradient.dtype))
         """Mu and lambda for mu's relative value one; lambda of all points, or of each, (P,)."""
-        mu, lame = lame_parameters(self.poissons_ratio)
-        return mu, lame if self.lame_ratio is None else (lame * self.lame_ratio).astype(self.gradient.dtype)
 
     def at(self, index: NDArray[np.intp], weights: Array) -> _Sampler:
         """Return a few of the points with weights of their own."""

@@ -57,14 +57,15 @@ def elastic_matrix(shape: ShapeFunctions, weights: Array, mu: float, lame: float
     for rows, columns, _, gradient in _dense_blocks(shape):
         slope = gradient * root[rows, None]
         product = [[slope[a].T @ slope[b] for b in range(a + 1)] for a in range(3)]
-        trace, volume = product[0][0] + product[1][1] + product[2][2], product
+        trace = product[0][0] + product[1][1] + product[2][2]
         if isinstance(lame, np.ndarray):
             volume = [[slope[a].T @ (lame[rows, None] * slope[b]) for b in range(a + 1)] for a in range(3)]
+        else:
+            volume = [[lame * one for one in row] for row in product]
         pick = np.ix_(columns, columns)
         for a in range(3):
             for b in range(a + 1):
-                along = volume[a][b] if volume is not product else lame * product[a][b]
-                block = along + mu * product[a][b].T
+                block = volume[a][b] + mu * product[a][b].T
                 if a == b:
                     block = block + mu * trace
                 found[a, :, b, :][pick] += block

@@ -213,6 +213,11 @@ class BuildOptions:
         given = DEFAULT_POISSONS_RATIO if self.poissons_ratio is None else self.poissons_ratio
         return given if isinstance(given, tuple) else (given,)
 
+    @property
+    def mean_ratio(self) -> float:
+        """Their mean: the ratio of what is made once for all of them, and to which a field is relative."""
+        return float(np.mean(self.poissons_ratios))
+
 
 def _checked(added: Sequence[tuple[ArrayLike, float]]) -> tuple[tuple[tuple[float, ...], float], ...]:
     """Return places and radii as numbers.
