@@ -32,6 +32,7 @@ class Handling:
             that holds the heaviest object's weight by friction, if that is more.
         care: What the reward loses for roughness, see `TaskConfig.care`.
         gentle: Column of that term of the reward, -1 for none.
+        terminates: Whether a peak beyond its limit ends the episode.
 
     Attributes:
         handled: `HANDLED`, shape (world_count, 5): contact force [N], principal strain and energy density [J/m^3] at
@@ -50,6 +51,7 @@ class Handling:
         force_limit: float | None,
         care: float = 0.0,
         gentle: int = -1,
+        terminates: bool = False,
     ) -> None:
         """Allocate the figures and watch the scene."""
         worlds, device = scene.world_count, scene.device
@@ -59,7 +61,8 @@ class Handling:
             pads = ParallelJaw.of(scene.config.arm).friction
         except ConfigError:  # a robot without a gripper holds nothing
             pads = 1.0
-        self._limits = (strain_limit, -1.0 if force_limit is None else force_limit, pads, friction, care, gentle)
+        limit = -1.0 if force_limit is None else force_limit
+        self._limits = (strain_limit, limit, pads, friction, care, gentle, int(terminates))
         self.handled = wp.zeros((worlds, len(HANDLED)), dtype=float, device=device)
         self.safe = wp.zeros(worlds, dtype=wp.bool, device=device)
         self.step_force, self.step_strain, self.force_limit, self.height = (

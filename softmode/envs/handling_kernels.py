@@ -9,7 +9,7 @@ from softmode.deformables.model.deformation_kernels import elastic_gradient
 from softmode.deformables.model.lane_kernels import vec8d
 from softmode.deformables.model.struct_kernels import Basis, Instances
 from softmode.deformables.potential.evaluate_kernels import material_of
-from softmode.envs.reward_kernels import StepResult, WorldState, grasped, is_there, tool_position
+from softmode.envs.reward_kernels import EndReason, StepResult, WorldState, grasped, is_there, tool_position
 
 wp.set_module_options({"enable_backward": False})
 
@@ -130,6 +130,7 @@ def judge(
     friction: int,  # column of the parameters
     care: float,  # what the reward loses for roughness
     gentle: int,  # column of that term, -1 for none
+    terminates: int,  # whether a peak beyond its limit ends the episode
     state: WorldState,
     result: StepResult,
     instances: Instances,
@@ -179,7 +180,10 @@ def judge(
                 handling.handled[w, Handled.drops] += 1.0
                 handling.falling_slot[w] = -1
     gently = handling.handled[w, Handled.peak_force] <= handling.force_limit[w]
-    handling.safe[w] = result.success[w] and gently and handling.handled[w, Handled.peak_strain] <= strain_limit
+    gently = gently and handling.handled[w, Handled.peak_strain] <= strain_limit
+    handling.safe[w] = result.success[w] and gently
+    if terminates != 0 and not gently:
+        result.failure[w] = EndReason.ROUGH
 
 
 @wp.kernel

@@ -28,6 +28,8 @@ class EndReason(IntEnum):
     """Another object left the container that it belongs in."""
     FAILED = 5
     """A rule of the task itself was broken: its `evaluate` wrote so."""
+    ROUGH = 6
+    """Force or strain was beyond its limit (`TaskConfig.terminate_when_rough`)."""
 
 
 @wp.struct

@@ -191,6 +191,7 @@ class Task:
                 force_limit=config.force_limit,
                 care=config.care,
                 gentle=self.term_names.index("gentle") if "gentle" in self.term_names else -1,
+                terminates=config.terminate_when_rough,
             )
             self.outcome: dict[str, wp.array] = {
                 "success": self.success,

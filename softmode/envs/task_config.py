@@ -99,6 +99,8 @@ class TaskConfig:
     care: float = 0.0
     """What the reward of a step loses for rough handling, of tasks with the term ``gentle``: this times how far force
     or strain in it, whichever is a larger share of its limit, is beyond half of the limit."""
+    terminate_when_rough: bool = False
+    """Whether an episode ends, failed, where force or strain is beyond its limit: then rough hands earn no more."""
     camera: CameraName = "front"
     """Camera of pixel observations: one in front of the table, or one on the hand."""
     image_size: int = 96
