@@ -11,6 +11,7 @@ import warp as wp
 
 import softmode  # noqa: F401  (registers the environments)
 from softmode.envs.handling_kernels import DROP, GENTLE, LEAST_FORCE, MARGIN, ROUGHEST, principal_strain
+from softmode.envs.reward_kernels import EndReason
 from softmode.envs.scripted import scripted_policy
 from softmode.envs.tasks.lift_soft.task import LiftSoftConfig, LiftSoftEnv
 from softmode.errors import ConfigError
@@ -106,10 +107,14 @@ def test_an_object_that_is_let_go_has_dropped(lift: LiftSoftEnv) -> None:
 
 
 def test_a_success_beyond_the_limit_is_not_safe() -> None:
-    """Two worlds of one seed, one limit: the scripted lift is a success and, with a limit of 3 N, not a safe one."""
+    """Worlds of one seed: the scripted lift is a success and, with a limit of 3 N, not a safe one.
+
+    Where rough hands end an episode, it ends there, as a failure.
+    """
     safe: list[Any] = []
-    for limit in (None, 3.0):
-        envs: Any = gym.make_vec("softmode/LiftSoft-v0", num_envs=1, force_limit=limit, autoreset_mode="SameStep")
+    for limit, ends in ((None, False), (3.0, False), (3.0, True)):
+        given = {"force_limit": limit, "terminate_when_rough": ends, "autoreset_mode": "SameStep"}
+        envs: Any = gym.make_vec("softmode/LiftSoft-v0", num_envs=1, **given)
         policy = scripted_policy(envs)
         envs.reset(seed=0)
         ended = np.zeros(1, bool)
@@ -117,6 +122,11 @@ def test_a_success_beyond_the_limit_is_not_safe() -> None:
             _, _, terminated, truncated, infos = envs.step(policy())
             ended = terminated | truncated
         final = infos["final_info"]
+        if ends:
+            assert terminated.all() and final["end_reason"][0] == EndReason.ROUGH and not final["is_success"].any()
+            assert 3.0 < final["peak_force"][0] <= safe[1][1]
+            envs.close()
+            continue
         assert final["is_success"].all() and final["_is_safe_success"].all() and infos["peak_force"] == 0.0
         safe.append((bool(final["is_safe_success"][0]), float(final["peak_force"][0])))
         envs.close()

@@ -12,7 +12,7 @@ from softmode.checks import require_fields, require_numbers
 from softmode.envs.markers import sphere_marker
 from softmode.envs.observation import Segment
 from softmode.envs.parameters import Parameter
-from softmode.envs.presets import rl_scene
+from softmode.envs.presets import gentle, rl_scene
 from softmode.envs.soft_env import SoftEnv
 from softmode.envs.soft_vector_env import SoftVectorEnv
 from softmode.envs.task import Task
@@ -65,9 +65,13 @@ class LiftSoftConfig(TaskConfig):
 
     @classmethod
     def presets(cls) -> Mapping[str, Self]:
-        """Return "beam": object and goals of Isaac Lab's `Isaac-Lift-Soft-Franka`, as high as this arm reaches."""
+        """Return "beam" and "gentle".
+
+        The first has object and goals of Isaac Lab's `Isaac-Lift-Soft-Franka`, as high as this arm reaches.
+        """
         scene = replace(lift_scene(), object=BEAM, material=BEAM_MATERIAL)
-        return {"beam": cls(scene=scene, yaw_range=0.5, goal_height=0.2, goal_range=(0.08, 0.15, 0.08))}
+        beam = cls(scene=scene, yaw_range=0.5, goal_height=0.2, goal_range=(0.08, 0.15, 0.08))
+        return {"beam": beam, "gentle": gentle(cls())}
 
 
 class LiftSoft(Task):

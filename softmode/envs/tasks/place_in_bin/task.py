@@ -18,7 +18,7 @@ from softmode.envs.episodes import FALL
 from softmode.envs.observation import Segment
 from softmode.envs.parameters import Parameter
 from softmode.envs.placement import Arcs
-from softmode.envs.presets import RL_SOLVER
+from softmode.envs.presets import RL_SOLVER, gentle
 from softmode.envs.soft_env import SoftEnv
 from softmode.envs.soft_vector_env import SoftVectorEnv
 from softmode.envs.task import Task
@@ -153,10 +153,11 @@ class PlaceInBinConfig(TaskConfig):
 
     @classmethod
     def presets(cls) -> Mapping[str, Self]:
-        """Return "plush": three plush toys, which cost more time."""
+        """Return "plush", three plush toys, which cost more time, and "gentle"."""
         build = BuildOptions(mode_count=3, cubature_count=128)
         toy, other = (ObjectConfig(size=size, surface_count=160, build=build) for size in (0.07, 0.055))
-        return {"plush": cls(scene=replace(bin_scene(), object=toy, others=(other, other)))}
+        plush = cls(scene=replace(bin_scene(), object=toy, others=(other, other)))
+        return {"plush": plush, "gentle": gentle(cls())}
 
 
 class PlaceInBin(Task):
