@@ -65,12 +65,27 @@ def values_of(config: Any, start: Any = None) -> dict[str, Any]:
 def with_config(env: str, options: dict[str, Any]) -> dict[str, Any]:
     """Return keyword arguments of a softmode environment, a ``config`` that is a dict as the configuration it means.
 
+    Beside a preset the dict holds what differs from it.
+
     Raises:
-        ConfigError: If a field is unknown or outside its range.
+        ConfigError: If a field is unknown or outside its range, or there is no such preset.
     """
     if not isinstance(options.get("config"), dict) or not is_soft(env):
         return options
-    return {**options, "config": config_of(config_class(env), options["config"])}
+    kind, given, rest = config_class(env), options["config"], dict(options)
+    if rest.get("preset") is not None:
+        given = _merged(values_of(kind.preset(rest.pop("preset")), kind()), given)
+    return {**rest, "config": config_of(kind, given)}
+
+
+def _merged(values: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    """Return JSON values with others in their place, dicts field by field."""
+    both = {name: _merged(values[name], value) for name, value in over.items() if _are_dicts(values.get(name), value)}
+    return {**values, **over, **both}
+
+
+def _are_dicts(*values: Any) -> bool:
+    return all(isinstance(value, dict) for value in values)
 
 
 def split_config(env: str, options: dict[str, Any]) -> tuple[TaskConfig, dict[str, Any]]:
