@@ -1,8 +1,8 @@
 """How far from its training a policy still succeeds: stiffness, density, size, friction, delays, noise, drives.
 
-Run: ``python -m benchmarks.robustness policies/lift_soft.npz``. Every row changes one thing and leaves the rest as the
-policy was trained. A row is `--episodes` whole episodes on seeds that training does not use; all rows play the same
-seeds. Policies that were trained without delay do not see the last actions.
+Run: ``python -m benchmarks.robustness policies/lift_soft_robust.npz``. Every row changes one thing and leaves the rest
+as the policy was trained. A row is `--episodes` whole episodes on seeds that training does not use; all rows play the
+same seeds. Policies that were trained without delay do not see the last actions. Rough hands end no episode.
 """
 
 from __future__ import annotations
@@ -49,9 +49,9 @@ def rows(table: Mapping[str, Any]) -> list[tuple[str, str, dict[str, Any]]]:
 
 
 def worlds_of(policy: Policy, count: int, **options: Any) -> Any:
-    """Return worlds of the policy's environment in which all disturbances can be set."""
+    """Return worlds of the policy's environment in which all disturbances can be set, and rough hands end nothing."""
     on = {f"{name}_range": (neutral(name), max(neutral(name), 3.0 * ("delay" in name))) for name in LIMITS}
-    given = with_config(policy.env, {**policy.env_options, **on, **options})
+    given = with_config(policy.env, {**policy.env_options, "terminate_when_rough": False, **on, **options})
     return gym.make_vec(policy.env, num_envs=count, autoreset_mode="Disabled", **given)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -14,7 +15,9 @@ from softmode.envs.handling_kernels import DROP, GENTLE, LEAST_FORCE, MARGIN, RO
 from softmode.envs.reward_kernels import EndReason
 from softmode.envs.scripted import scripted_policy
 from softmode.envs.tasks.lift_soft.task import LiftSoftConfig, LiftSoftEnv
+from softmode.envs.tasks.place_in_bin.task import PlaceInBinConfig
 from softmode.errors import ConfigError
+from softmode.learning.config_values import split_config
 
 DOWN = np.array([0.0, 0.0, -1.0, 0.0, -1.0], np.float32)
 
@@ -159,3 +162,17 @@ def test_limits_that_cannot_be_are_refused(given: dict[str, float]) -> None:
     """A limit is above zero and a share between 0 and 1; the message names it."""
     with pytest.raises(ConfigError, match=next(iter(given))):
         LiftSoftConfig(**given)
+
+
+def test_the_preset_has_weak_fingers_and_an_end_and_a_dict_beside_it_holds_what_differs() -> None:
+    """`gentle` of both tasks that have the term; in a dict fields of parts change one by one, the others stay."""
+    for task in (LiftSoftConfig, PlaceInBinConfig):
+        config = task.preset("gentle")
+        assert config.terminate_when_rough and config.care == 0.5
+        assert config.scene.control.squeeze_lead == 0.1 < task().scene.control.squeeze_lead
+    differs = {"scale_range": [0.8, 1.2], "scene": {"control": {"squeeze_lead": 0.2}}}
+    given, rest = split_config("softmode/PlaceInBin-v1", {"preset": "gentle", "config": differs, "seconds": 4.0})
+    stronger = replace(config.scene, control=replace(config.scene.control, squeeze_lead=0.2))
+    assert given == replace(config, scale_range=(0.8, 1.2), scene=stronger) and rest == {"seconds": 4.0}
+    with pytest.raises(ConfigError, match="has no preset 'rough'"):
+        split_config("softmode/PlaceInBin-v1", {"preset": "rough", "config": differs})

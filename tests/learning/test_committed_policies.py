@@ -13,10 +13,12 @@ pytestmark = needs("torch")
 FOLDER = Path(__file__).parents[2] / "policies"
 LEAST = {
     "lift_soft": (18, 20),
-    "lift_soft_gentle": (16, 20),
+    "lift_soft_gentle": (18, 20),
+    "lift_soft_robust": (18, 20),
     "lift_beam": (18, 20),
     "press_soft": (17, 20),
     "push_soft": (15, 20),
+    "push_soft_robust": (18, 20),
     "place_in_bin": (18, 20),
     "lift_soft_pixels": (8, 10),
 }
