@@ -142,6 +142,12 @@ def default_box() -> Recipe:
 
 
 @kept
+def default_cube() -> Recipe:
+    """Return a cube of 10 cm as users get one."""
+    return Recipe(name="cube", of=((0.1,) * 3,), points=4000, samples=800, options=BuildOptions())
+
+
+@kept
 def default_ball(poissons_ratio: float = 0.3) -> Recipe:
     """Return a ball of 5 cm radius as users get one, with functions for a Poisson's ratio."""
     options = BuildOptions(poissons_ratio=poissons_ratio)

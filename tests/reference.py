@@ -200,9 +200,20 @@ def dented_penalty(penetration: np.ndarray, eps: float, ratio: float) -> np.ndar
     return reach / eps * (0.5 * weight * energy).sum(axis=-1)
 
 
-def normal_potential(penetration: np.ndarray, eps: float, ratio: float = 0.0, depth: float = 0.0) -> np.ndarray:
-    """Return the contact potential per unit stiffness: a dented penalty, one nine times as stiff from ``depth`` on."""
-    return dented_penalty(penetration, eps, ratio) + 9.0 * penalty(penetration - depth, 2.0 * eps)
+def normal_potential(
+    penetration: np.ndarray,
+    eps: float,
+    ratio: float = 0.0,
+    depth: float = 0.0,
+    ridge: float = 0.0,
+    ridge_lead: float = 0.0,
+) -> np.ndarray:
+    """Return the contact potential per unit stiffness: a dented penalty, one nine times as stiff from ``depth`` on.
+
+    Edges of a box are a penalty of their own stiffness, ``ridge_lead`` deeper in.
+    """
+    faces = dented_penalty(penetration, eps, ratio) + 9.0 * penalty(penetration - depth, 2.0 * eps)
+    return faces + ridge * penalty(penetration + ridge_lead, eps)
 
 
 def friction_potential(y: np.ndarray, eps: float) -> np.ndarray:

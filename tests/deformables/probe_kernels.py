@@ -128,13 +128,15 @@ def evaluate_potentials(
     eps: wp.float64,
     ratio: wp.float64,
     depth: wp.float64,
+    ridge: wp.float64,
+    ridge_lead: wp.float64,
     # Out:
     normal_out: wp.array[wp.vec3d],
     friction_out: wp.array[wp.vec3d],
 ):
     """Evaluate both contact potentials: (value, slope, curvature) and (f0, f1 / y, f1')."""
     i = wp.tid()
-    value, slope, curvature = contact.normal_potential(x[i], eps, ratio, depth)
+    value, slope, curvature = contact.normal_potential(x[i], eps, ratio, depth, ridge, ridge_lead)
     normal_out[i] = wp.vec3d(value, slope, curvature)
     f0, f1_over_y, f1_slope = contact.friction_potential(x[i], eps)
     friction_out[i] = wp.vec3d(f0, f1_over_y, f1_slope)

@@ -47,9 +47,11 @@ def test_mesh_contact_is_not_lost_when_deep():
 # -- potentials --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("ratio, depth", [(0.0, 0.0), (0.3, 1.0e-3), (40.0, 4.0e-3)])
-def test_potentials(ratio, depth):
-    """psi_n is p^3/(6 eps), p^2/2 - eps p/2 + eps^2/6 and a stiffer one from a depth on, C2; psi_t IPC's eq. (13)."""
+@pytest.mark.parametrize(
+    "given", [(0.0, 0.0, 0.0, 0.0), (0.3, 1.0e-3, 0.5, 2.0e-3), (40.0, 4.0e-3, 0.01, -1.0e-3)], ids=str
+)
+def test_potentials(given):
+    """psi_n is p^3/(6 eps), p^2/2 - eps p/2 + eps^2/6, a stiffer one from a depth on, that of edges; psi_t IPC's."""
     eps, step = 1.0e-3, 1.0e-9
     x = np.concatenate([np.linspace(-eps, 12 * eps, 501), [0.0, eps, 0.5 * eps]])
 
@@ -57,12 +59,12 @@ def test_potentials(ratio, depth):
         with wp.ScopedDevice("cpu"):
             normal = wp.zeros(len(values), dtype=wp.vec3d)
             friction = wp.zeros(len(values), dtype=wp.vec3d)
-            inputs = [wp.array(values, dtype=wp.float64), *map(wp.float64, (eps, ratio, depth))]
+            inputs = [wp.array(values, dtype=wp.float64), *map(wp.float64, (eps, *given))]
             wp.launch(evaluate_potentials, dim=len(values), inputs=inputs, outputs=[normal, friction])
         return normal.numpy(), friction.numpy()
 
     normal, friction = evaluate(x)
-    np.testing.assert_allclose(normal[:, 0], reference.normal_potential(x, eps, ratio, depth), rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(normal[:, 0], reference.normal_potential(x, eps, *given), rtol=1e-12, atol=1e-15)
     plus, minus = evaluate(x + step), evaluate(x - step)
     # Curvature jumps in its own slope only (C2), so differences err by step times 1/eps.
     np.testing.assert_allclose((plus[0] - minus[0])[:, 0] / (2 * step), normal[:, 1], atol=1e-9)

@@ -260,13 +260,18 @@ def test_frozen_normal_force_is_named() -> None:
 
 
 def test_a_normal_that_turns_is_refused() -> None:
-    """On a sphere the normal turns: refused, unless it is taken for fixed. On the face of a box it does not."""
+    """On a sphere or an edge the normal turns: refused unless it is taken for fixed. On the face of a box it does not.
+
+    What the edge of a box presses is restored as it was: the recorded step is at its root.
+    """
     body = cube()
 
     def gradients(shape: str, **options: bool) -> dict[str, np.ndarray]:
         def populate(world: newton.ModelBuilder) -> None:
             add_reduced_body(world, body, material=Material(friction=0.0), position=(0.0, 0.0, 0.047))
-            below = wp.transform(wp.vec3(0.0, 0.0, -0.2), wp.quat_identity())
+            edge = shape == "edge"
+            turn = wp.quat_from_axis_angle(wp.vec3(0.0, 1.0, 0.0), 0.25 * np.pi if edge else 0.0)
+            below = wp.transform(wp.vec3(0.002, 0.0, -0.2 * (2.0**0.5 if edge else 1.0)), turn)
             if shape == "sphere":
                 world.add_shape_sphere(-1, xform=below, radius=0.2)
             else:
@@ -280,9 +285,10 @@ def test_a_normal_that_turns_is_refused() -> None:
         return adjoint.backward(loss_q=np.ones((2, adjoint.total, 3))).numpy()
 
     gradients("box")
-    with pytest.raises(ConfigError, match="fixed_normals=True"):
-        gradients("sphere")
-    gradients("sphere", fixed_normals=True)
+    for shape in ("sphere", "edge"):
+        with pytest.raises(ConfigError, match="fixed_normals=True"):
+            gradients(shape)
+        gradients(shape, fixed_normals=True)
 
 
 def test_deep_overlap_is_refused() -> None:

@@ -30,7 +30,9 @@ from softmode.deformables.contact.penalty_kernels import (
     shear_yield,
     stiffness_per_area,
 )
+from softmode.deformables.contact.ridge_kernels import REACH, RIDGE, face_beside_edge, ridge_in_cell
 from softmode.deformables.contact.shape_query_kernels import (
+    BOX,
     CAPSULE,
     CYLINDER,
     HEIGHTFIELD,
@@ -152,7 +154,8 @@ def bound_samples(
         drift_upper = wp.max(drift_upper, samples.reach[i, k, 3])
     samples.drift_lower[i] = drift_lower
     samples.drift_upper[i] = drift_upper
-    grow = wp.vec3(instances.margin[i] + instances.contact_radius[i])
+    side = wp.sqrt(instances.area[i] / float(instances.sample_count[i]))
+    grow = wp.vec3(wp.max(instances.margin[i], REACH * side) + instances.contact_radius[i])
     samples.lower[i] = lower - grow
     samples.upper[i] = upper + grow
 
@@ -285,6 +288,45 @@ def march(
     return out
 
 
+@wp.func
+def shape_frame(shapes: Shapes, shape: int):
+    """Return origin and rotation of a shape at the start of the step, in float64."""
+    pose = shapes.transform[shape]
+    body = shapes.body[shape]
+    if body >= 0:
+        pose = shapes.body_q[body] * pose
+    return wp.vec3d(wp.transform_get_translation(pose)), wp.normalize(wp.quatd(wp.transform_get_rotation(pose)))
+
+
+@wp.func
+def ridge_of(
+    instances: Instances,
+    basis: Basis,
+    motion: Motion,
+    shapes: Shapes,
+    samples: Samples,
+    i: int,
+    row: int,
+    shape: int,
+    gap: float,
+):
+    """Return length and depth of the edges of a box in a cell [m], and the normal of the cell into the body."""
+    origin, rotation = shape_frame(shapes, shape)
+    x = wp.quat_rotate_inv(rotation, samples.position[i, row - instances.row_start[i]] - origin)
+    thick = shapes.margin[shape] + instances.contact_radius[i]
+    half = wp.vec3d(shapes.scale[shape] + wp.vec3(thick))
+    side = instances.scale[i] * wp.sqrt(basis.row_area[row])
+    length = wp.float64(0.0)
+    depth = wp.float64(0.0)
+    inward = wp.vec3d()
+    axis = face_beside_edge(half, x, gap, side)
+    if axis >= 0:
+        F = gradient_of(instances, basis, motion.q_start, i, row)
+        inward = -wp.normalize(wp.transpose(wp.inverse(F)) * wp.vec3d(basis.row_normal[row]))
+        length, depth = ridge_in_cell(half, x, wp.quat_rotate_inv(rotation, inward), wp.float64(side), axis)
+    return length, depth, inward
+
+
 @wp.kernel(launch_bounds=(256, 2))
 def find_contacts(
     instances: Instances,
@@ -315,6 +357,7 @@ def find_contacts(
     x = samples.position[i, s]
     row = instances.row_start[i] + s
     stuck = stick_shape[instances.particle_start[i] + s]
+    side = instances.scale[i] * wp.sqrt(basis.row_area[row])
     for c in range(candidate.shape[1]):
         if near[i, c] == 0 or (c < CULLED and (samples.near[i, s] >> c) & 1 == 0):
             continue
@@ -363,6 +406,10 @@ def find_contacts(
             end = travel
         if end > 0.0:
             query = march(shapes, shape, local, query, along, end, back, thick, instances.smoothing[i], far)
+        if kind == BOX and query.distance >= reach and query.distance < REACH * side:
+            length, _deep, _in = ridge_of(instances, basis, motion, shapes, samples, i, row, shape, query.distance)
+            if length > wp.float64(0.0):
+                reach = REACH * side
         gap = wp.float64(query.distance)
         if gap < wp.float64(reach) and gap < samples.gap[i, s, 1]:
             normal = wp.quat_rotate(turn, query.normal)
@@ -439,16 +486,6 @@ def motion_of_cell(
         x = wp.vec3(samples.position[i, row - instances.row_start[i]])
         velocity -= wp.vec3d(point_velocity(shapes.body_q[body], shapes.body_qd[body], shapes.body_com[body], x))
     return start, start + wp.float64(dt) * rate, wp.float64(dt) * wp.dot(n, velocity)
-
-
-@wp.func
-def shape_frame(shapes: Shapes, shape: int):
-    """Return origin and rotation of a shape at the start of the step, in float64."""
-    pose = shapes.transform[shape]
-    body = shapes.body[shape]
-    if body >= 0:
-        pose = shapes.body_q[body] * pose
-    return wp.vec3d(wp.transform_get_translation(pose)), wp.normalize(wp.quatd(wp.transform_get_rotation(pose)))
 
 
 @wp.func
@@ -612,6 +649,22 @@ def gather_contacts(
         ratio = stiffness * compliance * wp.float64(share * share)
         cell = cell_at(cell_shape, ahead, normal, gap, closing, ratio)
         turned = wp.dot(normal, (ahead - start) * cell.centre)
+        ridge = wp.float64(0.0)
+        if shapes.kind[shape] == BOX:
+            found = float(samples.gap[i, s, slot])
+            length, deep, inward = ridge_of(instances, basis, motion, shapes, samples, i, row, shape, found)
+            dent = dent_compliance(instances, i, relative, surface.dent_length[row])
+            if length > wp.float64(0.0) and dent > 0.0:
+                modulus = wp.float64(instances.scale[i] * surface.dent_length[row] / dent)
+                ridge = RIDGE * modulus * length / stiffness
+                face = cell.lead - gap
+                edge = wp.float64(0.5) * cell.onset + deep
+                least = wp.min(wp.max(face, edge), wp.float64(0.0)) - cell_shape.least
+                push = wp.max(face - least, wp.float64(0.1) * cell_shape.least)  # of the face too where it is far
+                push /= wp.float64(1.0) + stiffness * compliance
+                normal = wp.normalize(push * normal + ridge * wp.max(edge - least, wp.float64(0.0)) * inward)
+                constraints.ridge_lead[i, e] = edge - face
+        constraints.ridge[i, e] = ridge
         # both bodies feel the force at one point, not the shape at its own surface: a pair of forces on two
         # points would make angular momentum out of friction times penetration
         point = wp.vec3(samples.position[i, s] + start * cell.centre)

@@ -648,6 +648,7 @@ def write_pairs(
             constraints.dent_depth[a, e] = wp.float64(depth) + HARDENING_DEPTH * mine.least
             constraints.onset[a, e] = cell.onset
             constraints.lead[a, e] = cell.lead
+            constraints.ridge[a, e] = wp.float64(0.0)
             constraints.friction[a, e] = friction
 
 

@@ -65,25 +65,35 @@ def penalty(penetration: wp.float64, eps: wp.float64):
 
 
 @wp.func
-def normal_potential(penetration: wp.float64, eps: wp.float64, ratio: wp.float64, depth: wp.float64):
+def normal_potential(
+    penetration: wp.float64,
+    eps: wp.float64,
+    ratio: wp.float64,
+    depth: wp.float64,
+    ridge: wp.float64,
+    ridge_lead: wp.float64,
+):
     """Return the contact potential of a penetration [m] per unit stiffness, and its first two derivatives.
 
     The C2 penalty of springs in series with the dent, 1 / (1 + ratio) as stiff, and a stiffer penalty that sets in
-    twice as deep and as slowly, ``depth`` deeper where there is a dent.
+    twice as deep and as slowly, ``depth`` deeper where there is a dent; and that of the edges in the cell.
 
     Args:
         penetration: p [m].
         eps: Range of the onset [m].
         ratio: Compliance of the dent over that of the penalty; 0 for none.
         depth: Dent [m] from which on the stiffer penalty carries.
+        ridge: Stiffness of edges, see ``ridge_kernels``.
+        ridge_lead: How much deeper they are in [m].
     """
     share = wp.float64(1.0) / (wp.float64(1.0) + ratio)
     psi, slope, curvature = penalty(penetration, eps)
     psi_deep, slope_deep, curvature_deep = penalty(penetration - depth, HARDENING_RANGE * eps)
+    psi_edge, slope_edge, curvature_edge = penalty(penetration + ridge_lead, eps)
     return (
-        share * psi + HARDENING * psi_deep,
-        share * slope + HARDENING * slope_deep,
-        share * curvature + HARDENING * curvature_deep,
+        share * psi + HARDENING * psi_deep + ridge * psi_edge,
+        share * slope + HARDENING * slope_deep + ridge * slope_edge,
+        share * curvature + HARDENING * curvature_deep + ridge * curvature_edge,
     )
 
 
@@ -91,7 +101,14 @@ def normal_potential(penetration: wp.float64, eps: wp.float64, ratio: wp.float64
 def contact_potential(constraints: PointConstraints, penetration: wp.float64, i: int, e: int):
     """Return the potential of a contact at a penetration [m] per unit stiffness, and its first two derivatives."""
     ratio = constraints.stiffness[i, e] * constraints.dent_compliance[i, e]
-    return normal_potential(penetration, constraints.onset[i, e], ratio, constraints.dent_depth[i, e])
+    return normal_potential(
+        penetration,
+        constraints.onset[i, e],
+        ratio,
+        constraints.dent_depth[i, e],
+        constraints.ridge[i, e],
+        constraints.ridge_lead[i, e],
+    )
 
 
 @wp.func

@@ -36,6 +36,8 @@ def contact_response(
     stiffness: wp.float64,
     compliance: wp.float64,
     depth: wp.float64,
+    ridge: wp.float64,
+    ridge_lead: wp.float64,
     friction: wp.float64,
     stick: wp.float64,
     deep: wp.float64,
@@ -55,6 +57,8 @@ def contact_response(
         stiffness: Of the pin, or of the contact's penalty [N/m].
         compliance: That of the dent [m/N].
         depth: Dent [m] from which on the contact hardens.
+        ridge: Stiffness of edges over that of the penalty.
+        ridge_lead: How much deeper they are in [m].
         friction: Coefficient of friction.
         stick: Stiffness of the spring of friction [N/m]; 0 for friction without memory.
         deep: The same where the dent along the surface is used up [N/m].
@@ -71,12 +75,13 @@ def contact_response(
         return half * stiffness * wp.dot(total, total), -stiffness * total, stiffness * identity, held, total
     gap = wp.dot(n, total)
     ratio = stiffness * compliance
-    psi, slope, curvature = normal_potential(-gap, eps, ratio, depth)
+    psi, slope, curvature = normal_potential(-gap, eps, ratio, depth, ridge, ridge_lead)
     bound = slope
     if mode == int(FIRST):
         # in an impact the first guess lies far too deep: friction of such a force would be too stiff to solve
         start = wp.min(wp.dot(n, offset), wp.float64(0.0))
-        _psi, bound, _curvature = normal_potential(eps - wp.float64(2.0) * start, eps, ratio, depth)
+        first = eps - wp.float64(2.0) * start
+        _psi, bound, _curvature = normal_potential(first, eps, ratio, depth, ridge, ridge_lead)
     pressed = pressed_by(slope, bound, held, stiffness, mode)
     # offset = gap n + memory - drift of the shape: the tangential part is the slip
     t = total - gap * n

@@ -3,7 +3,8 @@
 import warp as wp
 
 from softmode.deformables.contact.detection_kernels import CULLED, Shapes
-from softmode.deformables.contact.shape_query_kernels import HEIGHTFIELD, PLANE
+from softmode.deformables.contact.ridge_kernels import REACH
+from softmode.deformables.contact.shape_query_kernels import BOX, HEIGHTFIELD, PLANE
 from softmode.deformables.model.interpolation_cpu_kernels import interpolate_rows
 from softmode.deformables.model.lane_kernels import LANES
 from softmode.deformables.model.struct_kernels import Basis, Instances, Motion, Samples
@@ -13,6 +14,7 @@ wp.set_module_options({"enable_backward": False})
 SLACK = 1.0e-5
 """Rounding of distances in float32, over the larger of 1 m and the coordinates of a shape."""
 NAMES = {"CULLED": int(CULLED), "PLANE": PLANE, "HEIGHTFIELD": HEIGHTFIELD, "SLACK": SLACK}
+NAMES |= {"BOX": BOX, "REACH": float(REACH)}
 
 
 @wp.kernel
@@ -48,7 +50,7 @@ def _cull_snippet() -> str:
     const int* own = (const int*)candidate.data + (size_t)i * candidate_max;
     const int* close = (const int*)near.data + (size_t)i * candidate_max;
     struct Frame {
-        double turn[9], origin[3], lower[3], upper[3], linear[3], angular[3], centre[3], thick, slack;
+        double turn[9], origin[3], lower[3], upper[3], linear[3], angular[3], centre[3], thick, slack, edge;
         int shape, bit;
     };
     Frame frames[CULLED];
@@ -88,6 +90,7 @@ def _cull_snippet() -> str:
         }
         f.thick = shapes.margin.data[shape] + instances.contact_radius.data[i];
         f.slack = SLACK * far;
+        f.edge = shapes.kind.data[shape] == BOX ? REACH * instances.scale.data[i] : 0.0;
         f.shape = shape;
         f.bit = 1 << c;
     }
@@ -96,14 +99,16 @@ def _cull_snippet() -> str:
     const float* drift = (const float*)samples.drift.data + 3 * first;
     const double* inner = (const double*)basis.inner_point.data + 3 * (size_t)instances.row_start.data[i];
     const double scale = instances.scale.data[i], margin = instances.margin.data[i];
+    const float* area = basis.row_area.data + instances.row_start.data[i];
     const int* memory = (const int*)stick_shape.data + 2 * (size_t)instances.particle_start.data[i];
     const bool fresh = dt_before.data[i] == 0.0;
     int* out = (int*)samples.near.data + first;
     for (int s = 0; s < sample_count; s += 8) {
-        lanes x[3], move[3], depth = 0.0;
+        lanes x[3], move[3], depth = 0.0, wide;
         words stuck[2];
         for (int lane = 0; lane < 8; ++lane) {
             const int sample = s + lane < sample_count ? s + lane : sample_count - 1, at = 3 * sample;
+            wide[lane] = area[sample];
             for (int k = 0; k < 2; ++k) stuck[k][lane] = memory[2 * sample + k];
             for (int k = 0; k < 3; ++k) {
                 x[k][lane] = position[at + k];
@@ -112,6 +117,7 @@ def _cull_snippet() -> str:
             }
         }
         depth = 2.0 * scale * __builtin_elementwise_sqrt(depth);
+        wide = __builtin_elementwise_sqrt(wide);
         words bits = (words)(long long)passed;
         for (int n = 0; n < frame_count; ++n) {
             const Frame& f = frames[n];
@@ -129,7 +135,8 @@ def _cull_snippet() -> str:
                 const lanes moving = f.linear[k] + f.angular[l] * arm[m] - f.angular[m] * arm[l];
                 travel += (move[k] - moving) * (move[k] - moving);
             }
-            const lanes reach = margin + 2.0 * __builtin_elementwise_sqrt(travel);
+            lanes reach = margin + 2.0 * __builtin_elementwise_sqrt(travel);
+            reach = f.edge * wide > reach ? f.edge * wide : reach;
             const words shape = (words)(long long)f.shape, bit = (words)(long long)f.bit;
             const words touched = (stuck[0] == shape) | (stuck[1] == shape) | (fresh ? ~(words)0 : (words)0);
             const lanes within = ((touched & (depth > reach)) ? depth : reach) + f.thick + f.slack;

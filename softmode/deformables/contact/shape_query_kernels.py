@@ -16,14 +16,14 @@ SPHERE = int(GeoType.SPHERE)
 CAPSULE = int(GeoType.CAPSULE)
 _ELLIPSOID = int(GeoType.ELLIPSOID)
 CYLINDER = int(GeoType.CYLINDER)
-_BOX = int(GeoType.BOX)
+BOX = int(GeoType.BOX)
 _MESH = int(GeoType.MESH)
 _CONE = int(GeoType.CONE)
 _CONVEX_MESH = int(GeoType.CONVEX_MESH)
 SMOOTH = sum(1 << kind for kind in (PLANE, HEIGHTFIELD, SPHERE, CAPSULE, _ELLIPSOID))
 """Bits of the kinds of shapes without edges."""
 
-SUPPORTED_SHAPES = (PLANE, HEIGHTFIELD, SPHERE, CAPSULE, _ELLIPSOID, CYLINDER, _BOX, _MESH, _CONE, _CONVEX_MESH)
+SUPPORTED_SHAPES = (PLANE, HEIGHTFIELD, SPHERE, CAPSULE, _ELLIPSOID, CYLINDER, BOX, _MESH, _CONE, _CONVEX_MESH)
 """Shape types a soft body can touch."""
 
 
@@ -372,7 +372,7 @@ def query_shape(shape_type: int, scale: wp.vec3, mesh: wp.uint64, x: wp.vec3, re
         out = query_cone(x, scale[0], scale[1])
     elif shape_type == _ELLIPSOID:
         out = query_ellipsoid(x, scale)
-    elif shape_type == _BOX:
+    elif shape_type == BOX:
         out = query_box(x, scale)
     elif shape_type == _MESH or shape_type == _CONVEX_MESH:
         out = query_mesh(x, mesh, scale, reach)

@@ -46,7 +46,7 @@ from softmode.errors import ConfigError, SolverDiverged
 Array = NDArray[np.float64]
 
 _CONSTRAINT = ("row", "partner_row", "shape", "normal", "offset", "stiffness", "dent_compliance", "dent_depth", "onset")
-_CONSTRAINT += ("friction", "stick", "stick_deep")
+_CONSTRAINT += ("ridge", "ridge_lead", "friction", "stick", "stick_deep")
 """What a step's point constraints are made of, besides their count: members of the solver's ``PointConstraints``."""
 FLAT = 0.02
 """Turn of a normal [rad] over the size of a body up to which a shape counts as flat: what float32 leaves of a plane."""

@@ -29,6 +29,9 @@ def find_turning(
     kind = shapes.kind[shape]
     if kind == PLANE or wp.length_sq(constraints.force[i, e]) == wp.float64(0.0):
         return
+    if constraints.ridge[i, e] > wp.float64(0.0):  # edges of a box in the cell have its normal
+        wp.atomic_max(turning_out, i, 1.0)
+        return
     origin, rotation = shape_frame(shapes, shape)
     s = constraints.partner_row[i, e] - instances.row_start[i]
     x = wp.vec3(wp.quat_rotate_inv(rotation, samples.position[i, s] - origin))

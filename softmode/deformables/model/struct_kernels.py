@@ -125,6 +125,8 @@ class PointConstraints:
     dent_depth: wp.array2d[wp.float64]  # contacts: dent from which on they harden [m]
     onset: wp.array2d[wp.float64]  # contacts: range of the gaps of the sample's cell [m], and
     lead: wp.array2d[wp.float64]  # how much earlier than the sample its cell begins to touch [m]
+    ridge: wp.array2d[wp.float64]  # contacts: stiffness of edges in the sample's cell over that of its penalty, and
+    ridge_lead: wp.array2d[wp.float64]  # how much deeper they are in than its face [m]
     friction: wp.array2d[wp.float64]
     stick: wp.array2d[wp.float64]  # tangential stiffness of a contact with memory [N/m]; 0: smoothed Coulomb friction
     stick_deep: wp.array2d[wp.float64]  # the same where the dent along the surface is used up [N/m]

@@ -133,6 +133,8 @@ def contact_at(
         constraints.stiffness[i, e],
         constraints.dent_compliance[i, e],
         constraints.dent_depth[i, e],
+        constraints.ridge[i, e],
+        constraints.ridge_lead[i, e],
         constraints.friction[i, e],
         constraints.stick[i, e],
         constraints.stick_deep[i, e],

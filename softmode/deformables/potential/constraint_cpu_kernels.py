@@ -52,7 +52,7 @@ _EVALUATE = """
     const double* const normals = (const double*)constraints.normal.data + 3 * own;
     const double* const offsets = (const double*)constraints.offset.data + 3 * own;
     wp::vec_t<3, lanes> n, offset, d;
-    lanes stiffness, compliance, depth, friction, stick, deep, held, onset;
+    lanes stiffness, compliance, depth, ridge, ridge_lead, friction, stick, deep, held, onset;
     words pinned;
     for (int k = 0; k < 8; ++k) {
         const size_t one = own + at[k];
@@ -61,6 +61,8 @@ _EVALUATE = """
         compliance[k] = constraints.dent_compliance.data[one];
         depth[k] = constraints.dent_depth.data[one];
         onset[k] = constraints.onset.data[one];
+        ridge[k] = constraints.ridge.data[one];
+        ridge_lead[k] = constraints.ridge_lead.data[one];
         friction[k] = constraints.friction.data[one];
         stick[k] = constraints.stick.data[one];
         deep[k] = constraints.stick_deep.data[one];
@@ -72,8 +74,8 @@ _EVALUATE = """
         }
     }
     const Law::contact_response_results found = Law::contact_response(
-        pinned, offset, n, d, stiffness, compliance, depth, friction, stick, deep, held, onset, stick_range, mode,
-        exact);
+        pinned, offset, n, d, stiffness, compliance, depth, ridge, ridge_lead, friction, stick, deep, held, onset,
+        stick_range, mode, exact);
     double* const slips = (double*)constraints.slip.data + 3 * own;
     double* const forces = (double*)constraints.force.data + 3 * own;
     for (int k = 0; k < count; ++k) {

@@ -171,6 +171,8 @@ def evaluate_constraint(
         step.constraints.stiffness[i, e],
         step.constraints.dent_compliance[i, e],
         step.constraints.dent_depth[i, e],
+        step.constraints.ridge[i, e],
+        step.constraints.ridge_lead[i, e],
         step.constraints.friction[i, e],
         step.constraints.stick[i, e],
         step.constraints.stick_deep[i, e],

@@ -1,0 +1,95 @@
+"""Edges and corners of a box that press a cube, against finite elements in three dimensions."""
+
+import newton
+import numpy as np
+import pytest
+import warp as wp
+from scipy.spatial.transform import Rotation
+
+from softmode.deformables.materials.material import Material
+from softmode.deformables.model.authoring import add_reduced_body
+from tests.bodies import default_cube
+from tests.scenes import Scene
+
+EDGE, MODULUS, PLATE = 0.1, 1.0e5, 0.02
+LARGE = 0.3
+"""Half extent of the box that presses [m]."""
+WEDGE = {0.01: 0.00200, 0.02: 0.00459, 0.03: 0.00745, 0.05: 0.01382}
+"""Force over E edge^2 by depth over edge: `benchmarks/edge_elements.py`; coarser elements give 1.5 % more."""
+CORNER = {0.02: 0.000203, 0.03: 0.000470, 0.05: 0.00133}
+"""The same; meshes differ by 4 %."""
+PLACES = ((0.0, 0.0), (0.002, 0.001), (-0.003, 0.002), (0.0045, -0.003))
+"""Where it presses, from the middle of the face [m]."""
+
+
+class Edged:
+    """A cube between a plate and an edge or a corner of a box, without friction.
+
+    Args:
+        kind: "wedge" or "corner".
+    """
+
+    def __init__(self, kind: str) -> None:
+        """Build the scene."""
+        turn = Rotation.from_euler("y", 45.0, degrees=True)
+        if kind == "corner":
+            turn = Rotation.align_vectors([[0.0, 0.0, 1.0]], [[1.0, 1.0, 1.0]])[0]
+        corners = LARGE * np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, -1).T
+        self.up = -turn.apply(corners)[:, 2].min()
+
+        def populate(world: newton.ModelBuilder) -> None:
+            material = Material(youngs_modulus=MODULUS, density=300.0, friction=0.0, mass_damping=200.0)
+            add_reduced_body(world, default_cube(), material=material)
+            world.add_shape_box(world.add_body(is_kinematic=True), hx=EDGE, hy=EDGE, hz=PLATE)
+            frame = wp.transform(wp.vec3(), wp.quat(*map(float, turn.as_quat())))
+            world.add_shape_box(world.add_body(is_kinematic=True), xform=frame, hx=LARGE, hy=LARGE, hz=LARGE)
+
+        self.scene = Scene(populate, [default_cube()], dt=0.01)
+
+    def force(self, depth: float, place: tuple[float, float], steps: int = 40) -> float:
+        """Go on from what is pressed so far; return the force [E edge^2] at a depth [edges] at a place [m]."""
+        poses = np.zeros((2, 7), dtype=np.float32)
+        poses[:, 6], poses[0, 2] = 1.0, -0.5 * EDGE - PLATE
+        poses[1, :3] = *place, (0.5 - depth) * EDGE + self.up
+        for state in (self.scene.state, self.scene.next_state):
+            state.body_q.assign(poses)
+        self.scene.step(steps)
+        assert not self.scene.reduced.status.numpy().any()
+        constraints = self.scene.reduced.view.constraints
+        count = int(constraints.count.numpy()[0])
+        below = constraints.shape.numpy()[0, :count] == 0
+        return float(constraints.force.numpy()[0, :count][below, 2].sum()) / (MODULUS * EDGE**2)
+
+    def ratios(self, expected: dict[float, float], place: tuple[float, float]) -> np.ndarray:
+        """Return forces over those expected by depth, each from a cube at rest."""
+        found = []
+        for depth in expected:
+            self.scene.restart()
+            found.append(self.force(depth, place))
+        return np.array(found) / np.array(list(expected.values()))
+
+
+def test_wedge() -> None:
+    """An edge of 90 degrees across a cube, 1 to 5 % deep, wherever it lies between the samples."""
+    edged = Edged("wedge")
+    ratios = np.array([edged.ratios(WEDGE, place) for place in PLACES])
+    assert ratios.mean(axis=0) == pytest.approx(1.0, abs=0.1)
+    assert ratios == pytest.approx(1.0, abs=0.2)
+
+
+@pytest.mark.rest
+def test_corner() -> None:
+    """A corner, 2 to 5 % deep, whose patch lies in one to six cells: on the mean over four places.
+
+    Two per cent deep, places differ by half of it.
+    """
+    edged = Edged("corner")
+    mean = np.mean([edged.ratios(CORNER, place) for place in PLACES], axis=0)
+    assert mean == pytest.approx(1.0, abs=0.1)
+
+
+def test_an_edge_presses_without_a_jump() -> None:
+    """As an edge goes in, no step of the force is twice the mean one, while samples and faces come to touch."""
+    edged, deepest, count = Edged("wedge"), 0.04, 40
+    down = [edged.force(deepest * k / count, (0.002, 0.001), 8) for k in range(count + 1)]
+    assert 0.0 < np.diff(down).min() and np.diff(down).max() < 2.0 * down[-1] / count
