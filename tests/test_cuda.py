@@ -182,3 +182,42 @@ def test_cuda_lifts():
         assert not terminated
     assert info["is_success"]
     assert 20 < observation["pixels"].std() < 120
+
+
+def lie_and_lift(device: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Let objects that a second reset has drawn lie in 16 worlds for 30 steps, then lift them.
+
+    Returns:
+        Height of each over the table after the first part, as a share of that at rest; why the episodes ended, and
+        which objects were lifted, shape (world_count,) each.
+    """
+    from softmode.envs import LiftSoftVectorEnv
+    from softmode.envs.tasks.lift_soft.scripted import ScriptedLift
+    from softmode.objects import ObjectSet
+    from tests.envs.object_kinds import KINDS, MATERIALS, lift
+
+    config = lift(ObjectSet(KINDS, materials=MATERIALS, resample=True))
+    options = {"device": device, "max_episode_steps": 180, "autoreset_mode": "Disabled"}
+    env = LiftSoftVectorEnv(16, config=config, **options)
+    env.reset(seed=1)
+    _, infos = env.reset(seed=2)
+    assert len(set(infos["object"].tolist())) == len(KINDS)
+    scene, still = env.task.scene, np.zeros(env.action_space.shape, np.float32)
+    for _ in range(30):
+        *_, infos = env.step(still)
+        assert not infos["end_reason"].any()
+    lying = scene.object_position.numpy()[:, 0, 2] / scene.occupancy.heights[:, 0]
+    policies = [ScriptedLift(env, world=world) for world in range(16)]
+    for _ in range(150):
+        *_, infos = env.step(np.stack([policy() for policy in policies]))
+    return lying, infos["end_reason"], infos["is_success"]
+
+
+def test_cuda_resets_draw_objects():
+    """Objects that resets put into worlds lie on the table, are lifted, and episodes end as on the CPU."""
+    lying, reasons, lifted = lie_and_lift("cuda:0")
+    expected, expected_reasons, expected_lifted = lie_and_lift("cpu")
+    np.testing.assert_allclose(lying, expected, atol=1e-2)
+    assert (expected > 0.9).all()
+    np.testing.assert_array_equal(reasons, expected_reasons)
+    assert lifted.mean() > 0.8 and expected_lifted.mean() > 0.8

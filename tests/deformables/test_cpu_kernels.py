@@ -11,16 +11,19 @@ import warp as wp
 
 from softmode.deformables.contact import detection_kernels, sample_cpu_kernels
 from softmode.deformables.contact.detection_kernels import CULLED
+from softmode.deformables.materials.material import Material
 from softmode.deformables.materials.material_kernels import MaterialModel
 from softmode.deformables.model.authoring import add_reduced_body
 from softmode.deformables.model.newton_step_kernels import ALL
 from softmode.deformables.potential import constraint_cpu_kernels, evaluate_kernels, point_cpu_kernels
 from softmode.deformables.solver import step_kernels
 from softmode.deformables.solver.evaluate import assemble, evaluate, gather_gradient, solve
+from softmode.deformables.solver.step_tables import StepTables
 from softmode.deformables.system import assembly_cpu_kernels, assembly_kernels
+from softmode.deformables.tools.body_choice import BodyChoice
 from tests.bodies import cube
 from tests.deformables.test_fused_system import loaded
-from tests.scenes import Scene, random_rotation
+from tests.scenes import GRAVITY, Scene, random_rotation
 
 DOUBLE, SINGLE = 1.0e-12, 4.0e-7
 """Relative rounding of sums in double precision in another order, and of results that are kept in single precision."""
@@ -287,3 +290,30 @@ def test_culled_shapes_touch_nothing(fresh: bool) -> None:
     for few, every in zip(*found, strict=True):
         np.testing.assert_array_equal(few[touched], every[touched])
     np.testing.assert_array_equal(found[0][0], found[1][0])
+
+
+def test_a_chosen_body_touches_where_nothing_is_culled(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on CUDA, where no kernel culls samples: a body that takes its own place lands with the bits of before."""
+    launch = StepTables.launch
+
+    def without_culling(tables: StepTables, kernel: Any, *arguments: Any, **options: Any) -> None:
+        if kernel is not sample_cpu_kernels.cull_samples:
+            launch(tables, kernel, *arguments, **options)
+
+    monkeypatch.setattr(StepTables, "launch", without_culling)
+    material, down = Material(), (0.0, 0.0, -GRAVITY)
+
+    def populate(world: Any) -> None:
+        add_reduced_body(world, cube(), material=material, position=(0.0, 0.0, 0.0501))
+
+    scene = Scene(populate, [cube()], gravity=down, ground=0.5)
+    choice = BodyChoice(scene.reduced, [cube()], [material])
+    landed = []
+    for _ in range(2):
+        scene.restart()
+        scene.solver.reset(scene.state)
+        scene.step(6)
+        assert scene.reduced.instance_force.numpy()[0, 2] > 0.0
+        landed.append([array.numpy() for array in (scene.state.particle_q, scene.state.particle_qd)])
+        choice.set(wp.zeros(1, dtype=int, device="cpu"), wp.ones(1, dtype=wp.bool, device="cpu"))
+    np.testing.assert_array_equal(*landed)

@@ -94,6 +94,8 @@ _ARRAYS = {
     "pins": "pin_instance pin_row pin_block",
     "turn turn_centre turn_shift": "instance",
 }
+FILLED = {"rate": 1, "volume_ratio": 1, "constraint": -1, "near": -1}
+"""What arrays of motion, points and samples hold at the start, where that is not zero."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -320,8 +322,8 @@ def allocate_tables(
     structs: dict[str, Any] = {
         "instances": instances,
         "basis": basis,
-        "motion": allocate(Motion, _MOTION, sizes, device, fill={"rate": 1}),
-        "points": allocate(Points, _POINTS, sizes, device, fill={"volume_ratio": 1}),
+        "motion": allocate(Motion, _MOTION, sizes, device, fill=FILLED),
+        "points": allocate(Points, _POINTS, sizes, device, fill=FILLED),
         "constraints": allocate(PointConstraints, _CONSTRAINTS, sizes, device),
         "arrays": allocate(NewtonArrays, _ARRAYS, sizes, device, given=of_system),
     }
@@ -335,7 +337,7 @@ def allocate_tables(
         options=options,
         layout=layout,
         scaled=scaled,
-        samples=allocate(Samples, _SAMPLES, sizes, device, fill={"constraint": -1, "near": -1}),
+        samples=allocate(Samples, _SAMPLES, sizes, device, fill=FILLED),
         **structs,
         spin=allocate(Spin, "instance", sizes, device),
         newton=state,

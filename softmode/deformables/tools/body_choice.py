@@ -17,10 +17,11 @@ from softmode.deformables.model.struct_kernels import Motion, PointConstraints, 
 from softmode.deformables.model.tables import allocate, starts_of
 from softmode.deformables.solver.solver_base import ReducedSolver, require_reduced
 from softmode.deformables.solver.solver_reduced import require_materials
+from softmode.deformables.solver.step_tables import FILLED
 from softmode.deformables.tools import body_choice_kernels as kernels
 from softmode.errors import ConfigError
 
-_KEPT = ("rate", "volume_ratio", "constraint", "shape", "direction", "system_start", "rigid_tolerance")
+_KEPT = (*FILLED, "shape", "direction", "system_start", "rigid_tolerance")
 """Arrays of a step that do not begin with zeros, that every step writes whole, or that have a row per world."""
 
 
