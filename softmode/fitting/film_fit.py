@@ -13,6 +13,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from softmode.checks import require_number
 from softmode.deformables.materials.material import Material
 from softmode.fitting.estimates import Estimate, Fitted, asked_for, floor_of
 from softmode.fitting.film import Clip, Image, blurred, find_mattes, open_cv
@@ -29,6 +30,8 @@ Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 SPECIFIC = np.geomspace(8.0, 3.0e4, 20)
 """Young's modulus over density of the starts [m^2/s^2]."""
+DAMPED = (5.0e-4, 4.0e-3)
+"""Viscosities of the starts [s]."""
 EARLY = 0.4
 """How much of the motion the starts are compared by [s]: later a stiffness is mistaken for one of another swing."""
 BEYOND = 5.0
@@ -65,7 +68,7 @@ def fit_film(
         material: Density and Poisson's ratio; the rest is where the fit begins. `Fitted.unweighed` tells what is known
             where the density is not measured.
         plate: The picture without the object, of the film's size.
-        exposure: For how long a frame sees [s].
+        exposure: For how long a frame sees [s], at most as long as it lasts.
         free: What is fitted besides, of `worlds.FREE` and `estimates.UNSEEN`.
         keep: File that keeps the stages that are done until all are; a fit that was cut off goes on with them.
         device: Warp device.
@@ -75,6 +78,7 @@ def fit_film(
         What was found; what it was fitted with; and all parameters, as `film_residuals.NAMES` has them.
 
     Raises:
+        ConfigError: If the exposure is longer than a frame.
         FitError: If the film does not show it: nothing moves, the object is another one, the motion is not followed;
             it has a picture of the film.
     """
@@ -86,6 +90,8 @@ def fit_film(
         if progress is not None:
             progress(stage, fraction)
 
+    hint = "give it in seconds: a frame cannot see for longer than it lasts"
+    require_number("exposure", exposure, at_least=0.0, at_most=1.01 * clip.interval, hint=hint)
     pixels = hashlib.sha256(clip.frames.tobytes() + clip.times.tobytes() + (b"" if plate is None else plate.tobytes()))
     kept = KeptStages(keep, pixels.hexdigest(), thing.body.fingerprint, camera, material, exposure, free)
     tell("looking at the film", 0.0)
@@ -124,12 +130,14 @@ def fit_film(
     residuals.frames, residuals.moving = early, True
 
     tell("trying stiffnesses", 0.15)
-    sets = np.repeat(space.changed(pose, "start", space.mean[START])[None], len(SPECIFIC), axis=0)
-    sets[:, 0] = np.log(SPECIFIC * material.density)
-    costs = kept("costs", lambda: cost_of(residuals(sets)))
+    begin = space.changed(pose, "start", space.mean[START])[None]
+    sets = np.repeat(np.repeat(begin, len(DAMPED), axis=0)[None], len(SPECIFIC), axis=0)
+    sets[..., 0], sets[..., 1] = np.log(SPECIFIC * material.density)[:, None], np.log(DAMPED)
+    tried = kept("costs", lambda: cost_of(residuals(sets.reshape(-1, len(NAMES))))).reshape(len(SPECIFIC), -1)
+    sets, costs = sets[np.arange(len(sets)), tried.argmin(axis=1)], tried.min(axis=1)
     none = space.changed(sets[0], "start", clip.times[-1])[None]
     motion = ("youngs_modulus", "viscosity", "start", *_POSE, "edge")
-    tight = replace(space, prior=space.changed(space.prior, "viscosity", 0.5))
+    narrow = space.changed(space.prior, "viscosity", 0.5)
 
     def refined(space: Space, start: Array, names: Sequence[str]) -> Array:
         """Return the cost and the parameters near a start."""
@@ -139,6 +147,7 @@ def fit_film(
     found: list[Array] = []
     for n, k in enumerate(np.argsort(costs)[:2]):
         tell("fitting", 0.3 + 0.15 * n)
+        tight = replace(space, prior=narrow, mean=space.changed(space.mean, "viscosity", sets[k, 1]))
         found.append(kept(f"start {n}", functools.partial(refined, tight, sets[k], motion)))
     residuals.frames = every
     unmoved = residuals(none)[0]
