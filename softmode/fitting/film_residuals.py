@@ -31,8 +31,8 @@ START, EDGE = NAMES.index("start"), NAMES.index("edge")
 CAMERA, HOLDER = slice(START + 1, EDGE), slice(EDGE + 1, len(NAMES))
 STATIC_SHARE = 0.9
 """How much of the mean over time is taken off: what is wrong in every frame is no motion."""
-COVER_NOISE, TRACK_NOISE = 0.25, 0.5
-"""Standard deviations of coverage, and of tracks [px]."""
+COVER_NOISE, TRACK_NOISE = 0.25, 1.5
+"""Standard deviations of coverage, and of tracks [px], whose places drift for many frames."""
 WORLDS, STEP = 5, 1.0 / 240.0
 """Worlds that run at a time: one place and its derivatives by four numbers; and their step [s]."""
 HOLDER_TIME = 0.08
