@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from softmode.checks import require_number
 from softmode.deformables.materials.material import Material
 from softmode.fitting.estimates import Estimate, Fitted, asked_for, floor_of
-from softmode.fitting.film import Clip, Image, blurred, find_mattes, open_cv
+from softmode.fitting.film import Clip, Image, blurred, cv2, find_mattes
 from softmode.fitting.film_residuals import CAMERA, HOLDER, NAMES, START, STEP, FilmResiduals, film_space
 from softmode.fitting.kept import KeptStages
 from softmode.fitting.least_squares import Solution, Space, cost_of, minimise
@@ -188,7 +188,6 @@ def fit_film(
 
 def _check_grip(residuals: FilmResiduals, area: NDArray[np.bool_], twin: NDArray[np.float32]) -> None:
     """Refuse a film in which what is held, an area (H, W), moves about as the rest does."""
-    cv2 = open_cv()
     soft = blurred(residuals.cover)
     rim = cv2.dilate((np.hypot(*np.gradient(soft[0])) > 0.1).astype(np.uint8), np.ones((3, 3))) > 0
     moves = []
@@ -231,7 +230,6 @@ def _told(
 
 def _compared(residuals: FilmResiduals, x: Array, cover: Array) -> tuple[Array, float, Any]:
     """Return where the film is compared (H, W): not on the holder; how far object and matte overlap; and the object."""
-    cv2 = open_cv()
     q, poses = residuals.states(x[None])[0, :1], residuals.poses(x[None])[0, :1]
     alpha = residuals.pictures.draw(q, poses)[0]
     near = cv2.dilate((alpha > 0.1).astype(np.uint8), np.ones((9, 9)))

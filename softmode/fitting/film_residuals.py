@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from softmode.deformables.materials.material import Material
-from softmode.fitting.film import Clip, Mattes, blurred, open_cv
+from softmode.fitting.film import Clip, Mattes, blurred, cv2
 from softmode.fitting.least_squares import Space
 from softmode.fitting.pictures import CoverPictures, project
 from softmode.fitting.tracks import Track
@@ -92,7 +92,6 @@ class FilmResiduals:
 
     def mask(self, mask: Array) -> None:
         """Compare pixels where a mask (H, W) is 1, and near the object."""
-        cv2 = open_cv()
         self.region, self._target = mask, blurred(self.cover * mask)[:, ::2, ::2]
         near = cv2.dilate((self._target.max(axis=0) > 0.02).astype(np.uint8), np.ones((9, 9))) > 0
         self._pixels = near & (blurred(mask[None])[0, ::2, ::2] > 0.99)
