@@ -186,11 +186,8 @@ def find_mattes(clip: Clip, plate: Image | None) -> Mattes:
         raise clip.refused(f"its plate has shape {back.shape[:2]}", hint="take it with the same camera")
     _check_background(clip, smooth, noise)
     level = np.clip((smooth * back).sum(axis=3) / ((back * back).sum(axis=2) + 1e-6), 0.98, 1.02)
-    away = np.sqrt(((smooth - level[..., None] * back) ** 2).mean(axis=3))
-    cover = np.array([_solid(np.clip((a - 3.0 * noise) / (7.0 * noise), 0.0, 1.0)) for a in away])
-    cover = np.array(
-        [_softened(*one, 10.0 * noise) for one in zip(cover, smooth, level[..., None] * back, strict=True)]
-    )
+    parts = zip(smooth, level[..., None] * back, strict=True)
+    cover = np.array([_matte(*one, noise) for one in parts])
     if (cover > 0.5).mean(axis=(1, 2)).max() < 0.002 or (cover > 0.5).mean() > 0.7:
         hint = "film it before another background, or give the picture without it: --plate empty.png"
         raise clip.refused("the object cannot be told from the background", hint=hint, cover=cover)
@@ -208,33 +205,31 @@ def blurred(pictures: Array) -> NDArray[np.float32]:
     return np.array([cv2.GaussianBlur(p.astype(np.float32), (0, 0), 1.2) for p in pictures])
 
 
-def _solid(cover: Array) -> Array:
-    """Return a matte without specks and small holes."""
+def _matte(seen: Array, back: Array, noise: float) -> Array:
+    """Return what covers the background of a frame, 0..1, shape (H, W), without specks and small holes.
+
+    A pixel of the rim is covered by how far it is from the background, over how far the nearest one inside is; where
+    that one is like the background, by whether it is away from it at all.
+
+    Args:
+        seen: The frame (H, W, 3).
+        back: The background, likewise.
+        noise: Standard deviation of the frame's noise, of 255.
+    """
+    away = np.sqrt(((seen - back) ** 2).mean(axis=2))
+    cover = np.clip((away - 3.0 * noise) / (7.0 * noise), 0.0, 1.0)
     hard = (cover > 0.5).astype(np.uint8)
     count, label, stats, _ = cv2.connectedComponentsWithStats(hard)
     keep = np.isin(label, [i for i in range(1, count) if stats[i, 4] >= 25]).astype(np.uint8)
     closed = cv2.morphologyEx(hard, cv2.MORPH_CLOSE, np.ones((5, 5)))
-    return np.maximum(cover, closed) * cv2.dilate(keep, np.ones((3, 3)))
-
-
-def _softened(cover: Array, seen: Array, back: Array, least: float) -> Array:
-    """Return a matte (H, W) with shares at its rim: how far a pixel is from the background, over the next one inside.
-
-    Args:
-        cover: What is away from the background: 1 at pixels of the rim too.
-        seen: The frame (H, W, 3).
-        back: The background, likewise.
-        least: How far what is inside has to be from it, of 255; elsewhere the matte stays what it is.
-    """
+    cover = np.maximum(cover, closed) * cv2.dilate(keep, np.ones((3, 3)))
     outer = 1 - cv2.erode((cover > 0.5).astype(np.uint8), np.ones((5, 5)))
-    if outer.all():
-        return cover
     way, label = cv2.distanceTransformWithLabels(outer, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
     inside = np.zeros((label.max() + 1, 3))
     inside[label[outer == 0]] = seen[outer == 0]
-    full, here = (np.sqrt(((colors - back) ** 2).mean(axis=2)) for colors in (inside[label], seen))
-    known = (outer > 0) & (way < 5.0) & (cover > 0.0) & (full > least)
-    return np.where(known, np.clip(here / np.maximum(full, 1e-6), 0.0, 1.0), cover)
+    full = np.sqrt(((inside[label] - back) ** 2).mean(axis=2))
+    rim = (outer > 0) & (way < 5.0) & (cover > 0.0) & (full > 10.0 * noise)
+    return np.where(rim, np.clip(away / np.maximum(full, 1e-6), 0.0, 1.0), cover)
 
 
 def _check_background(clip: Clip, smooth: Array, noise: float) -> None:

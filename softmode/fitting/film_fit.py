@@ -130,8 +130,7 @@ def fit_film(
     residuals.frames, residuals.moving = early, True
 
     tell("trying stiffnesses", 0.15)
-    begin = space.changed(pose, "start", space.mean[START])[None]
-    sets = np.repeat(np.repeat(begin, len(DAMPED), axis=0)[None], len(SPECIFIC), axis=0)
+    sets = np.tile(space.changed(pose, "start", space.mean[START]), (len(SPECIFIC), len(DAMPED), 1))
     sets[..., 0], sets[..., 1] = np.log(SPECIFIC * material.density)[:, None], np.log(DAMPED)
     tried = kept("costs", lambda: cost_of(residuals(sets.reshape(-1, len(NAMES))))).reshape(len(SPECIFIC), -1)
     sets, costs = sets[np.arange(len(sets)), tried.argmin(axis=1)], tried.min(axis=1)
