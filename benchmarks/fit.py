@@ -120,7 +120,7 @@ def fem_truth(name: str) -> tuple[Any, Any, dict[str, Any], Material, int]:
     scene = Scene(
         name=name, shape=shape, energy="stable_neo_hookean_log", youngs_modulus=youngs_modulus, poissons_ratio=RATIO,
         density=DENSITY, clamps=(Clamp(region=end),), gravity=(0.0, 0.0, -9.81), dt=1.0 / 480.0, steps=480,
-        cell=0.02, grading=0.5,
+        cell=0.02, grading=0.95,
     )  # fmt: skip
     solid, moved = fem.simulate(scene, bdf2=True, viscosity=viscosity)
     import trimesh
