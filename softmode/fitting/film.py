@@ -186,8 +186,7 @@ def find_mattes(clip: Clip, plate: Image | None) -> Mattes:
         raise clip.refused(f"its plate has shape {back.shape[:2]}", hint="take it with the same camera")
     _check_background(clip, smooth, noise)
     level = np.clip((smooth * back).sum(axis=3) / ((back * back).sum(axis=2) + 1e-6), 0.98, 1.02)
-    parts = zip(smooth, level[..., None] * back, strict=True)
-    cover = np.array([_matte(*one, noise) for one in parts])
+    cover = np.array([_matte(f, k * back, noise) for f, k in zip(smooth, level[..., None], strict=True)])
     if (cover > 0.5).mean(axis=(1, 2)).max() < 0.002 or (cover > 0.5).mean() > 0.7:
         hint = "film it before another background, or give the picture without it: --plate empty.png"
         raise clip.refused("the object cannot be told from the background", hint=hint, cover=cover)

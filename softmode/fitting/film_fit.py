@@ -90,8 +90,7 @@ def fit_film(
         if progress is not None:
             progress(stage, fraction)
 
-    hint = "give it in seconds: a frame cannot see for longer than it lasts"
-    require_number("exposure", exposure, at_least=0.0, at_most=1.01 * clip.interval, hint=hint)
+    require_number("exposure", exposure, at_least=0.0, at_most=1.01 * clip.interval, hint="give it in seconds")
     pixels = hashlib.sha256(clip.frames.tobytes() + clip.times.tobytes() + (b"" if plate is None else plate.tobytes()))
     kept = KeptStages(keep, pixels.hexdigest(), thing.body.fingerprint, camera, material, exposure, free)
     tell("looking at the film", 0.0)
@@ -165,8 +164,7 @@ def fit_film(
     check_needed(best.x, slice(2, None), "not observable, because the twin needs")
     tell("the integrator's share", 0.95)
     shift = integrator_shift(thing, material, best.x, float(clip.times[-1] - best.x[START]), device)
-    x = best.x.copy()
-    x[:2] -= shift
+    x = best.x - np.pad(shift, (0, len(NAMES) - 2))
     told = _told(residuals, best, x, material, followed, free)
     details = {
         "converged": best.converged,
