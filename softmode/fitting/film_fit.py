@@ -32,6 +32,8 @@ SPECIFIC = np.geomspace(8.0, 3.0e4, 20)
 """Young's modulus over density of the starts [m^2/s^2]."""
 DAMPED = (5.0e-4, 4.0e-3)
 """Viscosities of the starts [s]."""
+LATE = (0.2, -0.3, -0.8)
+"""When the starts are let go, in frames from when it is expected: a film may begin after it."""
 EARLY = 0.4
 """How much of the motion the starts are compared by [s]: later a stiffness is mistaken for one of another swing."""
 BEYOND = 5.0
@@ -105,8 +107,7 @@ def fit_film(
     space = film_space(release - 0.25 * clip.interval, clip.interval, material)
 
     tell("finding the camera", 0.05)
-    still = np.unique(np.linspace(0, mattes.release, 3).astype(int))
-    residuals.frames = still
+    residuals.frames = np.unique(np.linspace(0, mattes.release, 3).astype(int))
     posed = replace(space, mean=space.changed(space.mean, "start", clip.times[-1]), high=np.full(len(NAMES), np.inf))
     pose = kept("pose", lambda: minimise(residuals, posed, posed.mean, (*_POSE, "edge"), rounds=6).x)
     mask, overlap, twin = _compared(residuals, pose, mattes.cover[0])
@@ -125,21 +126,22 @@ def fit_film(
         hint = "film it before another background, give --plate, or check --size, --up and the camera"
         raise clip.refused(what, hint=hint, **outlines)
     residuals.mask(mask)
-    early = every[clip.times <= release + EARLY]
-    residuals.frames, residuals.moving = early, True
+    residuals.frames, residuals.moving = every[clip.times <= release + EARLY], True
 
     tell("trying stiffnesses", 0.15)
-    sets = np.tile(space.changed(pose, "start", space.mean[START]), (len(SPECIFIC), len(DAMPED), 1))
-    sets[..., 0], sets[..., 1] = np.log(SPECIFIC * material.density)[:, None], np.log(DAMPED)
+    begin = space.changed(pose, "start", space.mean[START])
+    sets = np.tile(begin, (len(SPECIFIC), len(DAMPED), len(LATE), 1))
+    sets[..., 0], sets[..., 1] = np.log(SPECIFIC * material.density)[:, None, None], np.log(DAMPED)[:, None]
+    sets[..., START] += clip.interval * np.array(LATE)
+    sets = sets.reshape(len(SPECIFIC), -1, len(NAMES))
     tried = kept("costs", lambda: cost_of(residuals(sets.reshape(-1, len(NAMES))))).reshape(len(SPECIFIC), -1)
     sets, costs = sets[np.arange(len(sets)), tried.argmin(axis=1)], tried.min(axis=1)
-    none = space.changed(sets[0], "start", clip.times[-1])[None]
     motion = ("youngs_modulus", "viscosity", "start", *_POSE, "edge")
     narrow = space.changed(space.prior, "viscosity", 0.5)
 
     def refined(space: Space, start: Array, names: Sequence[str]) -> Array:
         """Return the cost and the parameters near a start."""
-        one = minimise(residuals, space, start, names, rounds=4, kept=_LASTING)
+        one = minimise(residuals, space, start, names, rounds=8, kept=_LASTING)
         return np.append(one.cost, one.x)
 
     found: list[Array] = []
@@ -148,10 +150,10 @@ def fit_film(
         tight = replace(space, prior=narrow, mean=space.changed(space.mean, "viscosity", sets[k, 1]))
         found.append(kept(f"start {n}", functools.partial(refined, tight, sets[k], motion)))
     residuals.frames = every
-    unmoved = residuals(none)[0]
     tell("fitting", 0.6)
     x = min(found, key=lambda one: float(one[0]))[1:]
-    x = kept("coverage", functools.partial(refined, space, x, names))[1:]
+    unmoved = residuals(space.changed(x, "start", clip.times[-1])[None])[0]
+    x = kept("coverage", functools.partial(refined, space, x, [n for n in names if "tilt" not in n]))[1:]
     tell("fitting with tracks", 0.8)
     residuals.anchor(tracks, x)
     best = minimise(residuals, space, x, names, rounds=6, kept=_LASTING)
