@@ -48,7 +48,7 @@ OPTIONAL = (
 CASES = {
     "command line": ("demo", "import softmode.cli.main; softmode.cli.main.main(['list-envs'])"),
     "film": ("demo", "from softmode.viz.film import Film; Film(Path('lift.mp4'))"),
-    "film to fit": ("fit", "from softmode.fitting.film import open_cv; open_cv()"),
+    "film to fit": ("fit", "from softmode.fitting.film import cv2; cv2.blur"),
     "tensors": ("rl", "import softmode, gymnasium as g; g.make_vec('softmode/PushSoft-v0', output='torch')"),
     "Stable-Baselines3": ("rl", "from softmode.envs.adapters import StableBaselinesVecEnv"),
     "rsl_rl": ("rsl-rl", "from softmode.envs.adapters import RslRlVecEnv"),

@@ -20,7 +20,6 @@ def side_by_side(residuals: FilmResiduals, x: NDArray[np.float64]) -> Iterator[N
         residuals: What the film was fitted with.
         x: All parameters.
     """
-    residuals.frames = np.arange(len(residuals.clip.times))
     q, poses = residuals.states(x[None])[0], residuals.poses(x[None])[0]
     colors = residuals.pictures.draw(q, poses, color=True)
     alpha = residuals.pictures.draw(q, poses)[..., None]

@@ -23,15 +23,21 @@ EDGE = 192
 """Longest edge to which frames are made smaller [px]."""
 
 
-def open_cv() -> Any:
-    """Return OpenCV.
+class _OpenCV:
+    """OpenCV, imported when a name of it is first used.
 
     Raises:
         MissingExtraError: If it is not installed.
     """
-    with needs_extra("fit", "a film is read with OpenCV"):
-        import cv2
-    return cv2
+
+    def __getattr__(self, name: str) -> Any:
+        """Return a function or a number of it."""
+        with needs_extra("fit", "a film is read with OpenCV"):
+            import cv2
+        return getattr(cv2, name)
+
+
+cv2 = _OpenCV()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -86,7 +92,6 @@ class Clip:
         Raises:
             AssetError: If it cannot be read.
         """
-        cv2 = open_cv()
         found = cv2.imread(str(path), cv2.IMREAD_COLOR)
         if found is None:
             raise AssetError(f"plate {path}: cannot be read", hint="give a .png or .jpg of the background")
@@ -105,7 +110,6 @@ class Clip:
             AssetError: If it is missing or cannot be read.
             FitError: If it is too short, or longer than `LONGEST`.
         """
-        cv2 = open_cv()
         if not path.is_file():
             raise AssetError(f"film {path}: no such file", hint="check the path")
         frames, moments, shrink = [], [], 1.0
@@ -130,7 +134,6 @@ class Clip:
 
 def _video(path: Path) -> Any:
     """Yield times [s] and frames (RGB) of a film."""
-    cv2 = open_cv()
     reader = cv2.VideoCapture(str(path))  # turns frames by the file's own flag, and gives 8 bits
     while True:
         good, frame = reader.read()
@@ -175,7 +178,6 @@ def find_mattes(clip: Clip, plate: Image | None) -> Mattes:
     Raises:
         FitError: If the camera moves, the film is cut, nothing is there or moves, or it leaves the picture.
     """
-    cv2 = open_cv()
     smooth = np.array([cv2.GaussianBlur(f.astype(np.float32), (0, 0), 0.6) for f in clip.frames])
     steps = np.diff(clip.frames.astype(np.float32), axis=0)
     noise = max(float(1.4826 / np.sqrt(2.0) * np.median(np.abs(steps[steps != 0.0]))) if steps.any() else 0.0, 1.0)
@@ -184,8 +186,7 @@ def find_mattes(clip: Clip, plate: Image | None) -> Mattes:
         raise clip.refused(f"its plate has shape {back.shape[:2]}", hint="take it with the same camera")
     _check_background(clip, smooth, noise)
     level = np.clip((smooth * back).sum(axis=3) / ((back * back).sum(axis=2) + 1e-6), 0.98, 1.02)
-    away = np.sqrt(((smooth - level[..., None] * back) ** 2).mean(axis=3))
-    cover = np.array([_solid(np.clip((a - 3.0 * noise) / (7.0 * noise), 0.0, 1.0)) for a in away])
+    cover = np.array([_matte(f, k * back, noise) for f, k in zip(smooth, level[..., None], strict=True)])
     if (cover > 0.5).mean(axis=(1, 2)).max() < 0.002 or (cover > 0.5).mean() > 0.7:
         hint = "film it before another background, or give the picture without it: --plate empty.png"
         raise clip.refused("the object cannot be told from the background", hint=hint, cover=cover)
@@ -200,18 +201,34 @@ def find_mattes(clip: Clip, plate: Image | None) -> Mattes:
 
 def blurred(pictures: Array) -> NDArray[np.float32]:
     """Return pictures (F, H, W) blurred by 1.2 px."""
-    cv2 = open_cv()
     return np.array([cv2.GaussianBlur(p.astype(np.float32), (0, 0), 1.2) for p in pictures])
 
 
-def _solid(cover: Array) -> Array:
-    """Return a matte without specks and small holes."""
-    cv2 = open_cv()
+def _matte(seen: Array, back: Array, noise: float) -> Array:
+    """Return what covers the background of a frame, 0..1, shape (H, W), without specks and small holes.
+
+    A pixel of the rim is covered by how far it is from the background, over how far the nearest one inside is; where
+    that one is like the background, by whether it is away from it at all.
+
+    Args:
+        seen: The frame (H, W, 3).
+        back: The background, likewise.
+        noise: Standard deviation of the frame's noise, of 255.
+    """
+    away = np.sqrt(((seen - back) ** 2).mean(axis=2))
+    cover = np.clip((away - 3.0 * noise) / (7.0 * noise), 0.0, 1.0)
     hard = (cover > 0.5).astype(np.uint8)
     count, label, stats, _ = cv2.connectedComponentsWithStats(hard)
     keep = np.isin(label, [i for i in range(1, count) if stats[i, 4] >= 25]).astype(np.uint8)
     closed = cv2.morphologyEx(hard, cv2.MORPH_CLOSE, np.ones((5, 5)))
-    return np.maximum(cover, closed) * cv2.dilate(keep, np.ones((3, 3)))
+    cover = np.maximum(cover, closed) * cv2.dilate(keep, np.ones((3, 3)))
+    outer = 1 - cv2.erode((cover > 0.5).astype(np.uint8), np.ones((5, 5)))
+    way, label = cv2.distanceTransformWithLabels(outer, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    inside = np.zeros((label.max() + 1, 3))
+    inside[label[outer == 0]] = seen[outer == 0]
+    full = np.sqrt(((inside[label] - back) ** 2).mean(axis=2))
+    rim = (outer > 0) & (way < 5.0) & (cover > 0.0) & (full > 10.0 * noise)
+    return np.where(rim, np.clip(away / np.maximum(full, 1e-6), 0.0, 1.0), cover)
 
 
 def _check_background(clip: Clip, smooth: Array, noise: float) -> None:
@@ -228,7 +245,6 @@ def _check_background(clip: Clip, smooth: Array, noise: float) -> None:
 
 def _check_alone(clip: Clip, cover: Array) -> None:
     """Refuse a film in which two things move that lie apart while nothing does; one that rests is no object."""
-    cv2 = open_cv()
     near = cv2.dilate((cover[0] > 0.5).astype(np.uint8), np.ones((9, 9)))
     count, label = cv2.connectedComponents(near)
     soft, moved = blurred(cover), []

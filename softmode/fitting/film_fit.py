@@ -13,9 +13,10 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from softmode.checks import require_number
 from softmode.deformables.materials.material import Material
 from softmode.fitting.estimates import Estimate, Fitted, asked_for, floor_of
-from softmode.fitting.film import Clip, Image, blurred, find_mattes, open_cv
+from softmode.fitting.film import Clip, Image, blurred, cv2, find_mattes
 from softmode.fitting.film_residuals import CAMERA, HOLDER, NAMES, START, STEP, FilmResiduals, film_space
 from softmode.fitting.kept import KeptStages
 from softmode.fitting.least_squares import Solution, Space, cost_of, minimise
@@ -29,6 +30,10 @@ Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 SPECIFIC = np.geomspace(8.0, 3.0e4, 20)
 """Young's modulus over density of the starts [m^2/s^2]."""
+DAMPED = (5.0e-4, 4.0e-3)
+"""Viscosities of the starts [s]."""
+LATE = (0.2, -0.3, -0.8)
+"""When the starts are let go, in frames from when it is expected: a film may begin after it."""
 EARLY = 0.4
 """How much of the motion the starts are compared by [s]: later a stiffness is mistaken for one of another swing."""
 BEYOND = 5.0
@@ -65,7 +70,7 @@ def fit_film(
         material: Density and Poisson's ratio; the rest is where the fit begins. `Fitted.unweighed` tells what is known
             where the density is not measured.
         plate: The picture without the object, of the film's size.
-        exposure: For how long a frame sees [s].
+        exposure: For how long a frame sees [s], at most as long as it lasts.
         free: What is fitted besides, of `worlds.FREE` and `estimates.UNSEEN`.
         keep: File that keeps the stages that are done until all are; a fit that was cut off goes on with them.
         device: Warp device.
@@ -75,6 +80,7 @@ def fit_film(
         What was found; what it was fitted with; and all parameters, as `film_residuals.NAMES` has them.
 
     Raises:
+        ConfigError: If the exposure is longer than a frame.
         FitError: If the film does not show it: nothing moves, the object is another one, the motion is not followed;
             it has a picture of the film.
     """
@@ -86,6 +92,7 @@ def fit_film(
         if progress is not None:
             progress(stage, fraction)
 
+    require_number("exposure", exposure, at_least=0.0, at_most=1.01 * clip.interval, hint="give it in seconds")
     pixels = hashlib.sha256(clip.frames.tobytes() + clip.times.tobytes() + (b"" if plate is None else plate.tobytes()))
     kept = KeptStages(keep, pixels.hexdigest(), thing.body.fingerprint, camera, material, exposure, free)
     tell("looking at the film", 0.0)
@@ -100,8 +107,7 @@ def fit_film(
     space = film_space(release - 0.25 * clip.interval, clip.interval, material)
 
     tell("finding the camera", 0.05)
-    still = np.unique(np.linspace(0, mattes.release, 3).astype(int))
-    residuals.frames = still
+    residuals.frames = np.unique(np.linspace(0, mattes.release, 3).astype(int))
     posed = replace(space, mean=space.changed(space.mean, "start", clip.times[-1]), high=np.full(len(NAMES), np.inf))
     pose = kept("pose", lambda: minimise(residuals, posed, posed.mean, (*_POSE, "edge"), rounds=6).x)
     mask, overlap, twin = _compared(residuals, pose, mattes.cover[0])
@@ -120,31 +126,34 @@ def fit_film(
         hint = "film it before another background, give --plate, or check --size, --up and the camera"
         raise clip.refused(what, hint=hint, **outlines)
     residuals.mask(mask)
-    early = every[clip.times <= release + EARLY]
-    residuals.frames, residuals.moving = early, True
+    residuals.frames, residuals.moving = every[clip.times <= release + EARLY], True
 
     tell("trying stiffnesses", 0.15)
-    sets = np.repeat(space.changed(pose, "start", space.mean[START])[None], len(SPECIFIC), axis=0)
-    sets[:, 0] = np.log(SPECIFIC * material.density)
-    costs = kept("costs", lambda: cost_of(residuals(sets)))
-    none = space.changed(sets[0], "start", clip.times[-1])[None]
+    begin = space.changed(pose, "start", space.mean[START])
+    sets = np.tile(begin, (len(SPECIFIC), len(DAMPED), len(LATE), 1))
+    sets[..., 0], sets[..., 1] = np.log(SPECIFIC * material.density)[:, None, None], np.log(DAMPED)[:, None]
+    sets[..., START] += clip.interval * np.array(LATE)
+    sets = sets.reshape(len(SPECIFIC), -1, len(NAMES))
+    tried = kept("costs", lambda: cost_of(residuals(sets.reshape(-1, len(NAMES))))).reshape(len(SPECIFIC), -1)
+    sets, costs = sets[np.arange(len(sets)), tried.argmin(axis=1)], tried.min(axis=1)
     motion = ("youngs_modulus", "viscosity", "start", *_POSE, "edge")
-    tight = replace(space, prior=space.changed(space.prior, "viscosity", 0.5))
+    narrow = space.changed(space.prior, "viscosity", 0.5)
 
     def refined(space: Space, start: Array, names: Sequence[str]) -> Array:
         """Return the cost and the parameters near a start."""
-        one = minimise(residuals, space, start, names, rounds=4, kept=_LASTING)
+        one = minimise(residuals, space, start, names, rounds=8, kept=_LASTING)
         return np.append(one.cost, one.x)
 
     found: list[Array] = []
     for n, k in enumerate(np.argsort(costs)[:2]):
         tell("fitting", 0.3 + 0.15 * n)
+        tight = replace(space, prior=narrow, mean=space.changed(space.mean, "viscosity", sets[k, 1]))
         found.append(kept(f"start {n}", functools.partial(refined, tight, sets[k], motion)))
     residuals.frames = every
-    unmoved = residuals(none)[0]
     tell("fitting", 0.6)
     x = min(found, key=lambda one: float(one[0]))[1:]
-    x = kept("coverage", functools.partial(refined, space, x, names))[1:]
+    unmoved = residuals(space.changed(x, "start", clip.times[-1])[None])[0]
+    x = kept("coverage", functools.partial(refined, space, x, [n for n in names if "tilt" not in n]))[1:]
     tell("fitting with tracks", 0.8)
     residuals.anchor(tracks, x)
     best = minimise(residuals, space, x, names, rounds=6, kept=_LASTING)
@@ -157,8 +166,7 @@ def fit_film(
     check_needed(best.x, slice(2, None), "not observable, because the twin needs")
     tell("the integrator's share", 0.95)
     shift = integrator_shift(thing, material, best.x, float(clip.times[-1] - best.x[START]), device)
-    x = best.x.copy()
-    x[:2] -= shift
+    x = best.x - np.pad(shift, (0, len(NAMES) - 2))
     told = _told(residuals, best, x, material, followed, free)
     details = {
         "converged": best.converged,
@@ -179,7 +187,6 @@ def fit_film(
 
 def _check_grip(residuals: FilmResiduals, area: NDArray[np.bool_], twin: NDArray[np.float32]) -> None:
     """Refuse a film in which what is held, an area (H, W), moves about as the rest does."""
-    cv2 = open_cv()
     soft = blurred(residuals.cover)
     rim = cv2.dilate((np.hypot(*np.gradient(soft[0])) > 0.1).astype(np.uint8), np.ones((3, 3))) > 0
     moves = []
@@ -222,7 +229,6 @@ def _told(
 
 def _compared(residuals: FilmResiduals, x: Array, cover: Array) -> tuple[Array, float, Any]:
     """Return where the film is compared (H, W): not on the holder; how far object and matte overlap; and the object."""
-    cv2 = open_cv()
     q, poses = residuals.states(x[None])[0, :1], residuals.poses(x[None])[0, :1]
     alpha = residuals.pictures.draw(q, poses)[0]
     near = cv2.dilate((alpha > 0.1).astype(np.uint8), np.ones((9, 9)))

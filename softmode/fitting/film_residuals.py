@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from softmode.deformables.materials.material import Material
-from softmode.fitting.film import Clip, Mattes, blurred, open_cv
+from softmode.fitting.film import Clip, Mattes, blurred, cv2
 from softmode.fitting.least_squares import Space
 from softmode.fitting.pictures import CoverPictures, project
 from softmode.fitting.tracks import Track
@@ -31,8 +31,8 @@ START, EDGE = NAMES.index("start"), NAMES.index("edge")
 CAMERA, HOLDER = slice(START + 1, EDGE), slice(EDGE + 1, len(NAMES))
 STATIC_SHARE = 0.9
 """How much of the mean over time is taken off: what is wrong in every frame is no motion."""
-COVER_NOISE, TRACK_NOISE = 0.25, 0.5
-"""Standard deviations of coverage, and of tracks [px]."""
+COVER_NOISE, TRACK_NOISE = 0.25, 1.5
+"""Standard deviations of coverage, and of tracks [px], whose places drift for many frames."""
 WORLDS, STEP = 5, 1.0 / 240.0
 """Worlds that run at a time: one place and its derivatives by four numbers; and their step [s]."""
 HOLDER_TIME = 0.08
@@ -92,7 +92,6 @@ class FilmResiduals:
 
     def mask(self, mask: Array) -> None:
         """Compare pixels where a mask (H, W) is 1, and near the object."""
-        cv2 = open_cv()
         self.region, self._target = mask, blurred(self.cover * mask)[:, ::2, ::2]
         near = cv2.dilate((self._target.max(axis=0) > 0.02).astype(np.uint8), np.ones((9, 9))) > 0
         self._pixels = near & (blurred(mask[None])[0, ::2, ::2] > 0.99)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.fitting.film import Clip, open_cv
+from softmode.fitting.film import Clip, cv2
 
 Array = NDArray[np.float64]
 MOST = 40
@@ -31,7 +31,6 @@ def follow(clip: Clip, cover: Array) -> list[Track]:
         clip: The film.
         cover: What is the object, 0..1, shape (F, H, W).
     """
-    cv2 = open_cv()
     grey = [cv2.GaussianBlur(cv2.cvtColor(f, cv2.COLOR_RGB2GRAY), (0, 0), 0.7) for f in clip.frames]
     how = {"winSize": (11, 11), "maxLevel": 3, "criteria": (3, 30, 0.01)}
     live: list[tuple[list[int], list[Array]]] = []

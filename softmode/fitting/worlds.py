@@ -60,12 +60,12 @@ class FitWorlds:
         self.model, self.body, self.count, self.dt = model, body, model.world_count, dt
         self.solver = SolverReduced(model, [body], options=options)
         self.pair, self._control = (model.state(), model.state()), model.control()
-        self._graph: Callable[[], None] | None = None
+        self._launch: Callable[[], None] = self._two_steps
 
     def reset(self) -> None:
         """Put all worlds at rest, and capture the steps if they are not yet."""
-        if self._graph is None:
-            self._graph = capture_graph(self._two_steps, self.model.device).launch
+        if self._launch == self._two_steps:
+            self._launch = capture_graph(self._two_steps, self.model.device).launch
         self.solver.status.zero_()
         for state in self.pair:
             self.solver.reset(state)
@@ -73,8 +73,7 @@ class FitWorlds:
 
     def step_twice(self) -> None:
         """Launch two steps, which end where they began."""
-        if self._graph is not None:
-            self._graph()
+        self._launch()
 
     def _two_steps(self) -> None:
         """Step from one state to the other and back."""

@@ -5,6 +5,7 @@ Builds objects of more functions than a fit takes, with an end held: the truth o
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import newton
@@ -84,6 +85,7 @@ def make_film(
     azimuth: float = 0.0,
     dt: float = 1.0 / 960.0,
     moved: tuple[Array, newton.Model] | None = None,
+    carry: Callable[[Array], tuple[Array, Array]] | None = None,
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8], PinholeCamera]:
     """Return frames (F, H, W, 3), the plate (H, W, 3), and the camera as it is told, in the axes of the file.
 
@@ -98,6 +100,7 @@ def make_film(
         azimuth: Turn of the camera about the object [rad].
         dt: Steps of the truth [s].
         moved: The truth's motion at every second step, where it is another one's.
+        carry: Gives means and covariances (S, 3, 3) of the splats for a motion that is not one of the body's functions.
     """
     r = np.random.default_rng(seed)
     q, model = moved or motion(thing, material, seconds + 0.1, dt)
@@ -130,11 +133,17 @@ def make_film(
     def shot(time: float) -> Array:
         k = np.clip(time / (2.0 * dt), 0.0, len(q) - 1.001)
         a = k - int(k)
-        soft(state).q.assign((1.0 - a) * q[int(k)] + a * q[int(k) + 1])
+        now = (1.0 - a) * q[int(k)] + a * q[int(k) + 1]
+        if carry is None:
+            soft(state).q.assign(now)
+            bound.update(state)
+        else:
+            means, covariances = carry(now)
+            bound.arrays.means.assign(means[None])
+            bound.arrays.covariances.assign(covariances[None, :, (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)])
         return picture()
 
     def picture() -> Array:
-        bound.update(state)
         camera.render(state)
         alpha = camera.images("film", "alpha").numpy()[0][..., None]
         return camera.images("film").numpy()[0] / 255.0 + (1.0 - alpha) * b * 0.05 * texture
@@ -148,6 +157,7 @@ def make_film(
     times = np.arange(int(seconds * fps)) / fps + late
     frames = np.array([sensor(np.mean([shot(max(t + s, 0.0)) for s in exposure], axis=0)) for t in times])
     soft(state).q.assign(thing.body.affine(np.eye(3), (0, 0, -50.0)))
+    bound.update(state)
     empty = picture()
     plate = np.mean([sensor(empty) for _ in range(15)], axis=0)
     return frames, (plate + 0.5).astype(np.uint8), told

@@ -18,7 +18,7 @@ from PIL import Image
 
 from softmode.cli.main import main
 from softmode.deformables import BuildOptions, Material
-from softmode.errors import FitError
+from softmode.errors import ConfigError, FitError
 from softmode.fitting.film import Clip, find_mattes
 from softmode.fitting.film_fit import fit_film
 from softmode.fitting.film_residuals import NAMES, FilmResiduals
@@ -76,6 +76,8 @@ def test_film(tmp_path: Path) -> None:
     fit = functools.partial(
         fit_film, thing, clip, camera, material=unknown, plate=plate, free=["poissons_ratio", "density"]
     )
+    with pytest.raises(ConfigError, match="exposure"):
+        fit(exposure=0.05)
     found, residuals, x = fit()
     modulus = found["youngs_modulus"]
     error = np.log(modulus.value / TRUE.youngs_modulus)

@@ -13,6 +13,7 @@ import trimesh
 from softmode.deformables import SolverReduced, add_reduced_body, set_states
 from softmode.deformables.model.namespaces import soft
 from softmode.errors import ConfigError
+from softmode.fitting.worlds import FitWorlds
 from softmode.objects import ObjectConfig, build_object, file_frame, load
 from softmode.objects.frame import in_body
 from softmode.objects.source import object_source
@@ -21,7 +22,10 @@ from tests.bodies import cube, freeform
 
 
 def test_states_of_a_batch() -> None:
-    """Each world takes its own coordinates and velocities; particles follow, and the step before is forgotten."""
+    """Each world takes its own coordinates and velocities; particles follow, and the step before is forgotten.
+
+    Worlds of a fit that were not reset fall from rest: by 3 g dt^2 in two implicit steps.
+    """
     body = cube()
     world, builder = newton.ModelBuilder(), newton.ModelBuilder()
     add_reduced_body(world, body)
@@ -44,6 +48,10 @@ def test_states_of_a_batch() -> None:
     for wrong in (q[:2], np.full_like(q, np.nan)):
         with pytest.raises(ConfigError, match="q: 3 worlds"):
             set_states(solver, state, q=wrong)
+    worlds = FitWorlds(model, body, dt=0.01)
+    worlds.step_twice()  # no reset has to come first
+    fallen = (soft(worlds.pair[0]).q.numpy() - soft(model.state()).q.numpy()).reshape(3, n, 3)
+    np.testing.assert_allclose(body.mean_basis @ fallen, [[0.0, 0.0, -9.81 * 3.0e-4]] * 3, rtol=1e-3, atol=1e-7)
 
 
 def test_frame_of_the_file() -> None:

@@ -100,6 +100,54 @@ class Energy:
         return self.m * (1.0 - 1.0 / (np.einsum("...ij,...ij->...", F, F) + 1.0))
 
 
+@dataclass(frozen=True)
+class Damped:
+    """An energy and what a solid of Kelvin and Voigt loses in a step: tau/h [mu D:D + l/2 tr(D)^2], D = E - E_before.
+
+    E is Green's strain, so that the stress is tau C : dE/dt, with dE/dt = D / h and Hooke's C.
+    """
+
+    elastic: Energy
+    mu: Array
+    """tau/h mu [Pa], of the quadrature points."""
+    lam: Array
+    """tau/h lambda [Pa], likewise."""
+    before: Array
+    """E_before, shape (..., 3, 3)."""
+
+    def _change(self, F: Array) -> tuple[Array, Array]:
+        """Return D and the stress S = 2 mu D + lambda tr(D) I."""
+        D = strain(F) - self.before
+        S = 2.0 * self.mu[..., None, None] * D
+        S[..., range(3), range(3)] += (self.lam * np.trace(D, axis1=-2, axis2=-1))[..., None]
+        return D, S
+
+    def value(self, F: Array) -> Array:
+        """Return the density [J/m^3] at F (..., 3, 3)."""
+        D, S = self._change(F)
+        return self.elastic.value(F) + 0.5 * np.einsum("...ij,...ij->...", D, S)
+
+    def stress(self, F: Array) -> Array:
+        """Return its derivative [Pa], likewise."""
+        return self.elastic.stress(F) + F @ self._change(F)[1]
+
+    def hessian(self, F: Array) -> Array:
+        """Return its second derivative [Pa], (..., 9, 9)."""
+        eye, S = np.eye(3), self._change(F)[1]
+        flat, left = F.reshape(*F.shape[:-2], 9), F @ F.swapaxes(-1, -2)
+        H = np.einsum("ik,...jl->...ijkl", eye, S)
+        H += self.mu[..., None, None, None, None] * (
+            np.einsum("...ik,jl->...ijkl", left, eye) + np.einsum("...il,...kj->...ijkl", F, F)
+        )
+        found = H.reshape(*F.shape[:-2], 9, 9) + self.elastic.hessian(F)
+        return found + (self.lam[..., None] * flat)[..., :, None] * flat[..., None, :]
+
+
+def strain(F: Array) -> Array:
+    """Return Green's strain (F^T F - I) / 2, (..., 3, 3)."""
+    return 0.5 * (F.swapaxes(-1, -2) @ F - np.eye(3))
+
+
 def cofactor(F: Array) -> Array:
     """Return J F^-T, (..., 3, 3)."""
     C = np.empty_like(F)
@@ -241,7 +289,11 @@ class Solid:
     ) -> None:
         """Integrate what stays constant."""
         self.mesh = mesh
-        self.energy = Energy.make(energy, np.broadcast_to(youngs_modulus, mesh.weights.shape), poissons_ratio)
+        points = mesh.weights.shape
+        self.energy: Energy | Damped = Energy.make(energy, np.broadcast_to(youngs_modulus, points), poissons_ratio)
+        modulus = np.broadcast_to(youngs_modulus, points) / (1.0 + poissons_ratio)
+        self.hooke = 0.5 * modulus, modulus * poissons_ratio / (1.0 - 2.0 * poissons_ratio)
+        """mu and lambda [Pa] of the quadrature points."""
         self.mass = self.gram(np.broadcast_to(density, mesh.weights.shape))
         """Mass matrix of one component [kg], (N, N)."""
         nodes = mesh.elements
@@ -422,6 +474,7 @@ def simulate(
     cell: float | None = None,
     substeps: int = 1,
     bdf2: bool = False,
+    viscosity: float = 0.0,
     tolerance: float = 1e-6,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[Solid, Array]:
@@ -432,6 +485,7 @@ def simulate(
         cell: Mean edge of the elements [m]; the scene's own when None.
         substeps: Steps per step of the scene (for a reference converged in time).
         bdf2: Second-order backward differences instead of implicit Euler; the first step is implicit Euler.
+        viscosity: tau [s] of the stress tau C : dE/dt, see `Damped`.
         tolerance: Newton's, relative to the largest edge of the bounding box. The last step is below it, so that the
             error left is that step squared: about 1e-12 of the edge.
         progress: Receives (step, iterations).
@@ -461,6 +515,7 @@ def simulate(
     x, v = scene.initial_position(mesh.nodes), scene.initial_velocity(mesh.nodes)
     x_old, v_old = x, v
     frames = [x - mesh.nodes]
+    elastic, e_old, e = solid.energy, np.zeros(1), strain(solid.deformation_gradient(x))
     for n in range(1, scene.steps * substeps + 1):
         time = n * dt
         multistep = bdf2 and n > 1
@@ -471,16 +526,22 @@ def simulate(
         linear = (later if multistep else first) * (solid.mass @ inertial) + weight
         for spring, motion in soft:
             linear = linear + spring @ motion.position(mesh.nodes, time)
+        if viscosity:
+            per_step = viscosity * (1.5 if multistep else 1.0) / dt
+            before = (4.0 * e - e_old) / 3.0 if multistep else e
+            solid.energy = Damped(elastic, *(per_step * value for value in solid.hooke), before)  # type: ignore[arg-type]
         guess = x + dt * v
         for mine, motion in exact:
             guess[mine] = motion.position(mesh.nodes[mine], time)
         found, iterations = (second if multistep else euler)(guess, linear, tolerance * scene.edge)
         speed = (3.0 * found - 4.0 * x + x_old) / (2.0 * dt) if multistep else (found - x) / dt
         x_old, v_old, x, v = x, v, found, speed
+        e_old, e = e, strain(solid.deformation_gradient(x))
         if n % substeps == 0:
             frames.append(x - mesh.nodes)
             if progress:
                 progress(n // substeps, iterations)
+    solid.energy = elastic
     return solid, np.array(frames)
 
 

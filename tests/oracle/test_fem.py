@@ -30,12 +30,16 @@ def solid(shape=CUBE, cell=0.5, energy="stable_neo_hookean", nu=NU, modulus=E):
     return fem.Solid(mesh, energy=energy, youngs_modulus=modulus, poissons_ratio=nu)
 
 
-@pytest.mark.parametrize("energy", ENERGIES)
+@pytest.mark.parametrize("energy", [*ENERGIES, "damped"])
 def test_energy_derivatives(energy):
     """Stress and Hessian are the central differences of the energy and the stress, J from -1 to 3."""
     rng = np.random.default_rng(0)
-    material = fem.Energy.make(energy, 1.0, NU)
     F = np.eye(3) + 0.6 * rng.normal(size=(200, 3, 3))
+    if energy == "damped":
+        before = fem.strain(F[::-1])
+        material = fem.Damped(fem.Energy.make(ENERGIES[1], 1.0, NU), np.full(200, 0.3), np.full(200, 0.7), before)
+    else:
+        material = fem.Energy.make(energy, 1.0, NU)
     h = 1e-5
     P, H = material.stress(F).reshape(-1, 9), material.hessian(F)
     for k in range(9):
