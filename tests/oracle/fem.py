@@ -131,7 +131,7 @@ def shape_functions(local: Array) -> tuple[Array, Array]:
 
 
 class Mesh:
-    """Hexahedra on the solid cells of a tensor grid, optionally mapped.
+    """Hexahedra on the solid cells of a tensor grid, optionally mapped; 27 Gauss points each, or those of a subclass.
 
     Args:
         lines: Grid lines of the three axes in reference coordinates [m].
@@ -271,7 +271,8 @@ class Solid:
         """Return int factor N_a N_b dV as a sparse (N, N) matrix; factor per quadrature point (E, 27)."""
         mesh, count = self.mesh, len(self.mesh.nodes)
         weight = mesh.weights * factor
-        block = np.einsum("eq,qa,qb->eab", weight, mesh.values, mesh.values, optimize=True)
+        at = "qa" if mesh.values.ndim == 2 else "eqa"
+        block = np.einsum(f"eq,{at},{at[:-1]}b->eab", weight, mesh.values, mesh.values, optimize=True)
         row, column = np.repeat(mesh.elements, 27, axis=1), np.tile(mesh.elements, (1, 27))
         return sparse.csr_matrix((block.ravel(), (row.ravel(), column.ravel())), shape=(count, count))
 
@@ -292,8 +293,8 @@ class Solid:
         mesh = self.mesh
         stress = self.energy.stress(self.deformation_gradient(x)) * mesh.weights[:, :, None, None]
         count = len(mesh.elements)
-        G = mesh.gradients.transpose(0, 2, 1, 3).reshape(count, 27, 81)  # (e, a, q k)
-        local = G @ stress.transpose(0, 1, 3, 2).reshape(count, 81, 3)
+        G = mesh.gradients.transpose(0, 2, 1, 3).reshape(count, 27, -1)  # (e, a, q k)
+        local = G @ stress.transpose(0, 1, 3, 2).reshape(count, -1, 3)
         out = np.empty_like(x)
         flat = mesh.elements.ravel()
         for c in range(3):
@@ -309,9 +310,9 @@ class Solid:
             H = (vector * np.maximum(value, 0.0)[..., None, :]) @ np.swapaxes(vector, -1, -2)
         H *= mesh.weights[:, :, None, None]
         count = len(mesh.elements)
-        half = H.reshape(count, 27, 27, 3) @ mesh.gradients.transpose(0, 1, 3, 2)  # (e, q, [i k j], b)
-        half = half.reshape(count, 27, 3, 3, 3, 27).transpose(0, 1, 3, 2, 4, 5).reshape(count, 81, 243)
-        G = mesh.gradients.transpose(0, 2, 1, 3).reshape(count, 27, 81)
+        half = H.reshape(count, -1, 27, 3) @ mesh.gradients.transpose(0, 1, 3, 2)  # (e, q, [i k j], b)
+        half = half.reshape(count, -1, 3, 3, 3, 27).transpose(0, 1, 3, 2, 4, 5).reshape(count, -1, 243)
+        G = mesh.gradients.transpose(0, 2, 1, 3).reshape(count, 27, -1)
         K = (G @ half).reshape(count, 27, 3, 3, 27)  # (e, a, i, j, b)
         return K.transpose(0, 1, 2, 4, 3).reshape(count, 81, 81)
 

@@ -185,6 +185,7 @@ def _build(
                 lame_ratio=lame_ratio,
                 scalar_stiffness=scalar,
                 density=density[parent],
+                surface=quadrature.surface_points - offset,
                 seeds=seeds,
                 spacing=quadrature.spacing,
                 edge=longest_edge(quadrature),
