@@ -30,7 +30,7 @@ from softmode.deformables.quadrature.quadrature_mesh import quadrature_from_mesh
 from softmode.deformables.reduction.build_body import build_body
 from softmode.deformables.reduction.cache import fingerprint_of
 from softmode.deformables.reduction.cubature import select_cubature
-from softmode.deformables.reduction.functions import RawFunctions, affine_first, orthonormalise
+from softmode.deformables.reduction.functions import RANK_TOLERANCE, RawFunctions, affine_first, orthonormalise
 from softmode.deformables.reduction.options import BuildOptions
 from softmode.deformables.solver.options import Integrator, SolverReducedOptions
 from softmode.deformables.solver.solver_reduced import SolverReduced
@@ -113,7 +113,14 @@ def _products(
     return _skin(mix).products(value, slope, points, length)
 
 
-def neural_body(quadrature: Quadrature, network: NeuralWeights, mode_count: int, name: str) -> NeuralBody:
+def neural_body(
+    quadrature: Quadrature,
+    network: NeuralWeights,
+    mode_count: int,
+    name: str,
+    *,
+    rank_tolerance: float = RANK_TOLERANCE,
+) -> NeuralBody:
     """Reduce an object by the weights of a network."""
     options = BuildOptions(mode_count=mode_count, kernel_count=KERNELS)
     body = build_body(quadrature, options, name=name, progress=False)
@@ -132,7 +139,9 @@ def neural_body(quadrature: Quadrature, network: NeuralWeights, mode_count: int,
     lead, others = skin.leading[[3, 0, 1, 2]], np.setdiff1d(np.flatnonzero(~skin.translating), skin.leading)
     kept = np.flatnonzero(skin.translating)
     fields = RawFunctions(raw, raw_gradient, mass, mass)
-    free = orthonormalise(fields, lead=np.eye(raw.shape[1])[:, lead], kept=kept, others=others)
+    free = orthonormalise(
+        fields, lead=np.eye(raw.shape[1])[:, lead], kept=kept, others=others, rank_tolerance=rank_tolerance
+    )
     found = affine_first(free, skin.leading, body.length)
     gradient = np.stack([raw_gradient[:, :, d] @ found.transform for d in range(3)], axis=2)
     chosen = select_cubature(quadrature.weights, gradient, body.point_count)

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.accuracy import FINE_RANK
 from benchmarks.baselines.neural_weights import NeuralWeights, NeuralWeightsOptions, train_many
 from benchmarks.baselines.reduced import neural_body
 from benchmarks.freeform.grips import POISSONS_RATIO
@@ -30,7 +31,7 @@ def stored_body(path: Path, name: str) -> Callable[[Any], ReducedBody] | None:
     if not arrays:
         return None
     network = NeuralWeights.of(arrays)
-    return lambda thing: neural_body(thing.quadrature, network, MODE_COUNT, thing.name)
+    return lambda thing: neural_body(thing.quadrature, network, MODE_COUNT, thing.name, rank_tolerance=FINE_RANK)
 
 
 def main() -> None:
