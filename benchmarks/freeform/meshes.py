@@ -151,12 +151,13 @@ def read_mesh(path: Path) -> MeshThing:
     try:
         found = trimesh.load(path, force="mesh", process=False)
         vertices, faces, _ = cap_holes(found.vertices, found.faces)  # type: ignore[attr-defined]
+        vertices = (vertices - vertices.min(axis=0)) / np.ptp(vertices, axis=0).max()
     except (ValueError, IndexError, KeyError) as error:
         raise AssetError(f"{path}: no triangle mesh ({error})", hint="take it out of the folder") from error
     return MeshThing(
         name=path.stem,
         key=hashlib.sha256(path.read_bytes()).hexdigest()[:16],
-        vertices=(vertices - vertices.min(axis=0)) / np.ptp(vertices, axis=0).max(),
+        vertices=vertices,
         faces=faces,
         youngs_modulus=1e8 if path.stem in HARD else 1e5,
     )
