@@ -82,7 +82,7 @@ def test_more_functions_never_stiffen(bodies: dict[int, ReducedBody], poissons_r
 
 
 def test_functions_beyond_forty_serve_pulls(bodies: dict[int, ReducedBody], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Springs draw ends apart that no build was told of: 60 functions err by two thirds of what those of modes alone do.
+    """Springs draw ends apart that no build was told of: 60 functions err by two thirds of what modes alone do.
 
     Errors are against 120 functions, in linear statics. The first forty are the same.
     """
