@@ -1,7 +1,7 @@
 """Run FreeForm's tables and figures beside the paper's numbers.
 
-Run: ``python -m benchmarks.freeform [--tables 1 2 3 4 5] [--figures 4 7] [--quick] [--output out/freeform.json]``,
-or ``--tables 2 --meshes FOLDER`` for Table 2 on meshes of your own.
+Run: ``python -m benchmarks.freeform [--tables 1 2 3 4 5] [--figures 4 5 7] [--quick] [--output out/freeform.json]``,
+or ``--tables 2 --figures 6 --meshes FOLDER`` for Table 2 and figure 6 on meshes of your own.
 What is run replaces its part of the output; Table 2 goes on where it was left.
 `benchmarks/freeform/TABLES.md` says what the rows mean. SPH is not run.
 """
@@ -9,19 +9,21 @@ What is run replaces its part of the output; Table 2 goes on where it was left.
 from __future__ import annotations
 
 import argparse
+import functools
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import warp as wp
 from threadpoolctl import threadpool_limits
 
-from benchmarks.freeform import beam, figures, objects, paper, training
+from benchmarks.freeform import beam, figures, objects, overlays, paper, training
 from benchmarks.freeform.meshes import REFERENCES, References
 
 Record = dict[str, Any]
 PICTURES = Path("docs/images")
-SPH = "not run (pysph does not install here as a wheel, and has no model of Kugelstadt et al.)"
+SPH = "not run (pysplishsplash 2.15 and 2.19 crash at import on Linux x86-64)"
 
 
 def cell(value: float | None) -> str:
@@ -121,7 +123,7 @@ def main() -> None:
     """Run what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--tables", type=int, nargs="*", choices=range(1, 6), default=None)
-    parser.add_argument("--figures", type=int, nargs="*", choices=(4, 7), default=None)
+    parser.add_argument("--figures", type=int, nargs="*", choices=(4, 5, 6, 7), default=None)
     parser.add_argument("--meshes", type=Path, help="Table 2 on the meshes of this folder instead")
     parser.add_argument("--references", type=Path, default=REFERENCES, help="stored references of meshes")
     parser.add_argument("--networks", type=Path, help="Simplicits' networks of benchmarks.freeform.simplicits")
@@ -161,9 +163,13 @@ def main() -> None:
             )
         elif 2 in asked:
             objects.run_objects(stored.get("table2", []), lambda found: save(table2=found), quick=options.quick)
-        for number in () if options.print else ((4, 7) if everything else options.figures or ()):
-            draw = {4: figures.figure4, 7: figures.figure7}[number]
-            save(**{f"figure{number}": draw(PICTURES / f"freeform_figure{number}.png", quick=options.quick)})
+        for number in () if options.print else ((4, 5, 7) if everything else options.figures or ()):
+            draw: dict[int, Callable[..., Any]] = {4: figures.figure4, 5: overlays.figure5, 7: figures.figure7}
+            if number == 6:
+                if options.meshes is None:
+                    parser.error("figure 6 shows meshes: name their folder by --meshes")
+                draw[6] = functools.partial(overlays.figure6, options.meshes)
+            save(**{f"figure{number}": draw[number](PICTURES / f"freeform_figure{number}.png", quick=options.quick)})
             print(f"figure {number}:", stored[f"figure{number}"], flush=True)
     printers = {1: print_table1, 2: print_table2, 3: print_table3, 4: print_table4, 5: print_table5}
     for number in sorted(tables):
@@ -173,7 +179,7 @@ def main() -> None:
             printers[number](stored[f"table{number}"])
         elif options.print:
             print(f"\nTable {number} is not in {options.output}")
-    for number in (4, 7) if options.print else ():
+    for number in (4, 5, 6, 7) if options.print else ():
         if f"figure{number}" in stored and (everything or number in (options.figures or ())):
             print(f"figure {number}:", stored[f"figure{number}"])
 
