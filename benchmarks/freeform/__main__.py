@@ -40,7 +40,7 @@ def print_table1(rows: list[Record]) -> None:
     for row in sorted(rows, key=lambda row: list(beam.BEAMS).index(row["beam"])):
         family, m = row["beam"].split()[0], row["m"]
         printed = [paper.FREEFORM[family].get(m), paper.SIMPLICITS[family].get(m)]
-        if row["basis"] == "MPM":
+        if "MPM" in row["basis"]:
             printed = [paper.FULL_ORDER["MPM"][family], None]
         elif row["basis"] == "told, exact":
             printed = [None, None]

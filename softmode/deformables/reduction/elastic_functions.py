@@ -10,6 +10,8 @@ out 3.4 times too stiff. Here the functions are chosen for elasticity itself, ou
    displacement fields, which are pure bending and twist: what a clamp needs that the build was not told of.
 3. The choice: the three components of every target, each target at unit energy and weighted by w = min(1, omega_1^2 /
    omega^2), are columns of one matrix. Its singular vectors in gradient energy come in the order of what they carry.
+4. After the first 40 functions come those of further targets: the same with the root of these weights, and what
+   springs do that pull the body's four farthest parts, or its two ends, each along an axis: low modes lack local pulls.
 
 On a body with exact regions the space is made of eigenmodes of the free body times an envelope that vanishes there, and
 on one with any regions also of translations along static responses and elastic modes of the kernels, which know how a
