@@ -24,7 +24,7 @@ from tests.oracle.scenes import SCENES
 Array = NDArray[np.float64]
 Faces = NDArray[np.int64]
 
-GREY, GREEN, BLUE, ORANGE = "0.45", "#2e9e4f", "#2f6fd0", "#d9822b"
+GREY, GREEN, BLUE, ORANGE = "0.7", "#2e9e4f", "#2f6fd0", "#d9822b"
 SHOWN = (("armadillo", "farthest"), ("cow-low-resolution", "boundary"), ("cheburashka", "fix"))
 """Objects of figure 6 and what is done to them; others of the folder where it lacks one."""
 ELEMENTS = 9
@@ -45,15 +45,15 @@ def paint(panel: Any, points: Array, faces: Faces, colour: str, view: Array, alp
     front = front[np.argsort(corner[front, :, 2].mean(axis=1), kind="stable")]
     light = 0.45 + 0.55 * np.clip(normal[front] @ np.array([0.3, 0.5, 0.81]), 0.0, 1.0)
     colours = np.column_stack([light[:, None] * np.array(to_rgb(colour)), np.full(len(front), alpha)])
-    panel.add_collection(PolyCollection(corner[front, :, :2], facecolors=colours, edgecolors="none"))
+    panel.add_collection(PolyCollection(corner[front, :, :2], facecolors=colours, edgecolors="none", antialiased=False))
 
 
 def magnify(panel: Any, layers: list[tuple[Array, Faces, str, float]], view: Array, off: Array) -> None:
-    """Frame a panel on layers, and magnify the place where the second is furthest off the first."""
+    """Frame a panel on layers, and magnify the place where the first is furthest off the second."""
     flat = np.concatenate([points @ view.T for points, *_ in layers])
     lower, upper = flat[:, :2].min(axis=0), flat[:, :2].max(axis=0)
     edge = ZOOM * (upper - lower).max()
-    at = (layers[1][0] @ view.T)[int(off.argmax()), :2]
+    at = (layers[0][0] @ view.T)[int(off.argmax()), :2]
     room = 0.03 * (upper - lower).max()
     panel.set(xlim=(lower[0] - room, upper[0] + 2.6 * edge), ylim=(lower[1] - room, upper[1] + room))
     panel.set(aspect="equal", xticks=[], yticks=[])
@@ -95,7 +95,7 @@ def beam_surface(count: int = 12) -> tuple[Array, Faces]:
 def figure5(path: Path, *, quick: bool = False) -> dict[str, float]:
     """Draw the bent and the twisted beam of three methods over finite elements; return the largest distances [m]."""
     rest, faces = beam_surface()
-    figure, panels = _panels(2, 3, (12.0, 5.2))
+    figure, panels = _panels(2, 3, (12.0, 4.4))
     view = np.array([[1.0, 0.0, 0.0], [0.0, 0.25, 0.97], [0.0, -0.97, 0.25]])
     record = {}
     for row, (name, at) in enumerate((("bend", 90), ("twist_360", 100))):
@@ -119,7 +119,7 @@ def figure5(path: Path, *, quick: bool = False) -> dict[str, float]:
             off = np.linalg.norm(points - expected, axis=1)
             record[f"{name}, {label}"] = float(off.max())
             panel = panels[3 * row + column]
-            layers = [(expected, faces, GREY, 1.0), (points, faces, colour, 0.55)]
+            layers = [(points, faces, colour, 1.0), (expected, faces, GREY, 0.5)]
             magnify(panel, layers, view, off)
             panel.set_title(f"{label}: up to {off.max():.2f} m off", fontsize=9)
     _save(figure, path)
@@ -157,7 +157,7 @@ def figure6(folder: Path, path: Path, *, quick: bool = False) -> dict[str, float
             off = np.linalg.norm(points - expected, axis=1)
             record[f"{thing.name}, {condition}, {label}"] = float(off.max())
             panel = panels[len(shown) * row + column]
-            magnify(panel, [(expected, faces, GREY, 1.0), (points, faces, colour, 0.55)], view, off)
+            magnify(panel, [(points, faces, colour, 1.0), (expected, faces, GREY, 0.5)], view, off)
             panel.set_title(
                 f"{label}\n{names[condition]}: up to {100.0 * off.max():.1f} % of its length off", fontsize=9
             )
