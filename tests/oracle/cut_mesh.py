@@ -87,6 +87,9 @@ class CutMesh(Mesh):
         count: Elements along the longest edge of its bounding box.
     """
 
+    reach = 1.0
+    """Tips of which rays see nothing have no element of their own."""
+
     def __init__(self, vertices: ArrayLike, faces: ArrayLike, count: int) -> None:
         """Integrate the elements."""
         vertex = np.asarray(vertices, float)

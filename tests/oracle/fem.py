@@ -141,6 +141,9 @@ class Mesh:
         to_reference: Its inverse.
     """
 
+    reach = 0.05
+    """How far a point may lie outside of its element, over half of the largest edge."""
+
     def __init__(
         self,
         lines: Lines,
@@ -196,14 +199,14 @@ class Mesh:
         """Return the matrix (P, N) that takes nodal values to rest points (P, 3) [m].
 
         A point outside takes the nearest element, whose functions go on beyond it: quadrature points of a cell that a
-        sloping face cuts may lie a twentieth of a cell outside.
+        sloping face cuts may lie a twentieth of half a cell outside.
         """
         x = self.to_reference(np.asarray(points, float))
         centre, half = 0.5 * (self.lower + self.upper), 0.5 * (self.upper - self.lower)
         near = KDTree(centre).query(x, k=min(12, len(centre)))[1].reshape(len(x), -1)
         excess = (np.abs(x[:, None] - centre[near]) - half[near]).max(axis=2)
         best = near[np.arange(len(x)), excess.argmin(axis=1)]
-        if excess.min(axis=1).max() > 0.05 * half.max():
+        if excess.min(axis=1).max() > self.reach * half.max():
             raise ValueError(f"points: row {int(excess.min(axis=1).argmax())} lies outside the mesh")
         values = shape_functions((x - centre[best]) / half[best])[0]
         rows = np.repeat(np.arange(len(x)), 27)
