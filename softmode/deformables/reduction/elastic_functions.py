@@ -265,8 +265,8 @@ def choose_functions(
 
 
 def _complete(shares: Array, count: int) -> int:
-    """Return a number of functions, `count` or the next larger one, after which shares fall."""
-    while count < len(shares) and shares[count] > EQUAL * shares[count - 1]:
+    """Return a number of functions, `count` or the next larger one, after which shares fall, or begin anew."""
+    while count < len(shares) and EQUAL < shares[count] / shares[count - 1] < 1.0 / EQUAL:
         count += 1
     return count
 
@@ -378,8 +378,7 @@ class _ElasticSpace:
         for block in blocks:
             found, share = self._extend(found, block, count)
             shares = np.concatenate([shares, share])
-        if later:
-            first = _complete(shares, FAR_AFTER)
+        if later and (first := _complete(shares, FAR_AFTER)) < count:
             found, share = self._extend(found[:, :first], np.concatenate(later, axis=1), count)
             shares = np.concatenate([shares[:first], share])
         return found, shares, judged
