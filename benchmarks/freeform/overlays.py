@@ -48,12 +48,12 @@ def paint(panel: Any, points: Array, faces: Faces, colour: str, view: Array, alp
     panel.add_collection(PolyCollection(corner[front, :, :2], facecolors=colours, edgecolors="none", antialiased=False))
 
 
-def magnify(panel: Any, layers: list[tuple[Array, Faces, str, float]], view: Array, off: Array) -> None:
-    """Frame a panel on layers, and magnify the place where the first is furthest off the second."""
+def magnify(panel: Any, layers: list[tuple[Array, Faces, str, float]], view: Array, place: int) -> None:
+    """Frame a panel on layers, and magnify the place of a vertex of the first."""
     flat = np.concatenate([points @ view.T for points, *_ in layers])
     lower, upper = flat[:, :2].min(axis=0), flat[:, :2].max(axis=0)
     edge = ZOOM * (upper - lower).max()
-    at = (layers[0][0] @ view.T)[int(off.argmax()), :2]
+    at = (layers[0][0] @ view.T)[place, :2]
     room = 0.03 * (upper - lower).max()
     panel.set(xlim=(lower[0] - room, upper[0] + 2.6 * edge), ylim=(lower[1] - room, upper[1] + room))
     panel.set(aspect="equal", xticks=[], yticks=[])
@@ -115,12 +115,14 @@ def figure5(path: Path, *, quick: bool = False) -> dict[str, float]:
             moved = particles.step()
         near = ((rest[:, None] - particles.rest) ** 2).sum(axis=2).argsort(axis=1)[:, :8]
         found["softmode's MPM, cells of 0.25 m"] = rest + carried(rest, particles.rest, moved, near), ORANGE
+        place = None
         for column, (label, (points, colour)) in enumerate(found.items()):
             off = np.linalg.norm(points - expected, axis=1)
             record[f"{name}, {label}"] = float(off.max())
             panel = panels[3 * row + column]
             layers = [(points, faces, colour, 1.0), (expected, faces, GREY, 0.5)]
-            magnify(panel, layers, view, off)
+            place = int(off.argmax()) if place is None else place
+            magnify(panel, layers, view, place)
             panel.set_title(f"{label}: up to {off.max():.2f} m off", fontsize=9)
     _save(figure, path)
     return record
@@ -141,7 +143,7 @@ def figure6(folder: Path, path: Path, *, quick: bool = False) -> dict[str, float
     shown = [(things.pop(name), condition) for name, condition in SHOWN if name in things]
     left = [condition for name, condition in SHOWN if name not in {thing.name for thing, _ in shown}]
     shown += list(zip(things.values(), left, strict=False))
-    figure, panels = _panels(2, len(shown), (4.6 * len(shown), 8.6))
+    figure, panels = _panels(2, len(shown), (4.6 * len(shown), 7.4))
     bases = {"FreeForm's functions, m = 16": (affine(16, rank_tolerance=FINE_RANK), GREEN)}
     bases["default functions, 68"] = EQUAL["default, 68"], BLUE
     names = {"farthest": "four far points pulled", "boundary": "both ends pulled", "fix": "held below"}
@@ -151,13 +153,15 @@ def figure6(folder: Path, path: Path, *, quick: bool = False) -> dict[str, float
         rest, faces = thing.vertices, thing.faces
         expected = rest + simulate(thing, grip, rest, 4 if quick else ELEMENTS, steps)[-1]
         view = np.array([[0.94, 0.0, -0.34], [0.06, 0.98, 0.17], [0.34, -0.18, 0.92]])
+        place = None
         for row, (label, (options, colour)) in enumerate(bases.items()):
             body = build_body(thing.quadrature, options, name=thing.name, progress=False)
             points = rest + reduced_motion(thing, grip, body, rest, steps)[0][-1]
             off = np.linalg.norm(points - expected, axis=1)
             record[f"{thing.name}, {condition}, {label}"] = float(off.max())
             panel = panels[len(shown) * row + column]
-            magnify(panel, [(points, faces, colour, 1.0), (expected, faces, GREY, 0.5)], view, off)
+            place = int(off.argmax()) if place is None else place
+            magnify(panel, [(points, faces, colour, 1.0), (expected, faces, GREY, 0.5)], view, place)
             panel.set_title(
                 f"{label}\n{names[condition]}: up to {100.0 * off.max():.1f} % of its length off", fontsize=9
             )

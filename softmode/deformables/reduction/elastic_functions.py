@@ -364,10 +364,9 @@ class _ElasticSpace:
             size = np.sqrt(np.maximum(value, floor))
             targets.append(target * (share / size))
             if pulled and count > FAR_AFTER:
-                later += [
-                    target * (np.sqrt(share) / size),
-                    *(self._responses_to_pulls(g, ratio, 1e3 * floor) for g in pulled),
-                ]
+                stiffness = elastic_stiffness(self.free, ratio, self.free_volume)
+                later.append(target * (np.sqrt(share) / size))
+                later += [self._responses_to_pulls(parts, stiffness, 1e3 * floor) for parts in pulled]
         blocks = []
         if self.held is not None:
             responses, more = self._responses(self.held, sum(poissons_ratios) / len(poissons_ratios))
@@ -461,7 +460,7 @@ class _ElasticSpace:
         modes = np.concatenate([mode, span @ turn[:, self.rigid :]], axis=1)
         return modes, np.concatenate([value, ritz[self.rigid :]])
 
-    def _responses_to_pulls(self, parts: Sequence[Pulled], poissons_ratio: float, shift: float) -> Array:
+    def _responses_to_pulls(self, parts: Sequence[Pulled], stiffness: Array, shift: float) -> Array:
         """Return what springs on parts do that pull one of them along an axis, (3 V, 3 parts)."""
         springs, loads, level = np.zeros_like(self.energy), [], np.array([part.level for part in parts])
         for part in parts:
@@ -469,12 +468,13 @@ class _ElasticSpace:
             load = (FAR_SPRINGS * part.weight)[:, None] * value
             springs += value.T @ load
             loads.append(load.sum(axis=0))
-        stiffness = elastic_stiffness(self.free, poissons_ratio, self.free_volume)
-        held = stiffness + np.kron(np.eye(3), springs)
+        held = stiffness.copy()
         held[np.diag_indices(len(held))] += shift  # A body in several parts is not held by all of these.
-        answer = linalg.cho_solve(
-            linalg.cho_factor(held, check_finite=False, overwrite_a=True), np.kron(np.eye(3), np.stack(loads, axis=1))
-        )
+        for i in range(3):
+            own = slice(i * self.count, (i + 1) * self.count)
+            held[own, own] += springs
+        factor = linalg.cho_factor(held.T, lower=True, check_finite=False, overwrite_a=True)
+        answer = linalg.cho_solve(factor, np.kron(np.eye(3), np.stack(loads, axis=1)), check_finite=False)
         return answer * (np.tile(level, 3) / np.sqrt(np.einsum("ak,ak->k", answer, stiffness @ answer)))
 
     def _responses(self, held: Held, poissons_ratio: float) -> tuple[Array, Array]:
