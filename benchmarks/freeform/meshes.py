@@ -39,7 +39,7 @@ PART = 0.1
 """Depth of a held end and radius of a held point, over the longest edge."""
 SAMPLES = 200
 """Points at which motions are compared."""
-COUNTS = (7, 10, 14)
+COUNTS = (6, 8, 11, 15)
 """Elements along the longest edge, from reference to reference."""
 STABLE = 1.0e-5
 """A reference stands once the next coarser one is no further from it (nMSE)."""
@@ -187,13 +187,16 @@ def simulate(thing: MeshThing, grip: Grip, points: Array, count: int, steps: int
 
 def refine(thing: MeshThing, condition: str, steps: int) -> tuple[Array, int, float]:
     """Return the motion of a reference that stands, its elements along the longest edge, and its distance (nMSE)."""
-    grip, before = thing.grip(condition), None
-    for count in COUNTS:
-        found = simulate(thing, grip, thing.points, count, steps)
-        distance = np.inf if before is None else float(((found - before) ** 2).sum(axis=2).mean())
+    grip, distance = thing.grip(condition), np.inf
+    found, count = simulate(thing, grip, thing.points, COUNTS[0], steps), COUNTS[0]
+    for finer in COUNTS[1:]:
         if distance <= STABLE:
             break
-        before = found
+        try:
+            before, found = found, simulate(thing, grip, thing.points, finer, steps)
+        except ConvergenceError:  # Small cut elements may be turned inside out; what is coarser stands, and says so.
+            break
+        count, distance = finer, float(((found - before) ** 2).sum(axis=2).mean())
     return found, count, distance
 
 
