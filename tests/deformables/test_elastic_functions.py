@@ -81,10 +81,10 @@ def test_more_functions_never_stiffen(bodies: dict[int, ReducedBody], poissons_r
         assert (more <= fewer * (1.0 + 1e-6)).all()  # gradients are stored in float32
 
 
-def test_functions_beyond_forty_serve_pulls(bodies: dict[int, ReducedBody], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_more_functions_serve_pulls(bodies: dict[int, ReducedBody], monkeypatch: pytest.MonkeyPatch) -> None:
     """Springs draw ends apart that no build was told of: 60 functions err by two thirds of what modes alone do.
 
-    Errors are against 120 functions, in linear statics. The first forty are the same.
+    Errors are against 120 functions, in linear statics. The default 48 are the same.
     """
     most, pulled = built(function_count=120), built(function_count=60)
     monkeypatch.setattr(elastic_functions, "FAR_AFTER", 120)
@@ -106,7 +106,7 @@ def test_functions_beyond_forty_serve_pulls(bodies: dict[int, ReducedBody], monk
     exact = moved(most)
     few, many = (np.linalg.norm(moved(body) - exact) for body in (pulled, plain))
     assert few < 2.0 / 3.0 * many
-    start = [body.evaluate(x[::7] - body.offset)[0][:, :40] for body in (pulled, plain)]
+    start = [body.evaluate(x[::7] - body.offset)[0][:, :FUNCTION_COUNT] for body in (pulled, plain)]
     np.testing.assert_allclose(start[0], start[1], atol=1e-8 * np.abs(start[1]).max())
 
 
