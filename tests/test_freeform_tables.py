@@ -9,13 +9,17 @@ import dataclasses
 
 import numpy as np
 import pytest
+import trimesh
 
-from benchmarks.freeform import figures, objects, training
-from benchmarks.freeform.objects import CONDITIONS, PULL, Thing, compare, fem_motion, reduced_motion
+from benchmarks.freeform import explicit, figures, grips, meshes, objects, training
+from benchmarks.freeform.grips import CONDITIONS, PULL
+from benchmarks.freeform.meshes import PART, MeshThing, References
+from benchmarks.freeform.objects import Thing, compare, fem_motion, reduced_motion
 from softmode.deformables.body.rkpm import make_basis
 from softmode.deformables.quadrature.quadrature import quadrature_from_box
 from softmode.deformables.reduction.build_body import build_body
 from softmode.deformables.reduction.options import BuildOptions
+from softmode.errors import AssetError
 from tests.shape_trials import Voxels
 
 STEPS = 3
@@ -35,7 +39,7 @@ def test_springs_have_the_volume_of_the_held_cells(condition: str) -> None:
     grip = bar.grip(condition)
     size = bar.voxels.cell
     cells = len(np.unique((grip.points / size).astype(int), axis=0))
-    expected = objects.SPRINGS * bar.youngs_modulus / size.max() ** 2 * cells * size.prod()
+    expected = grips.SPRINGS * bar.youngs_modulus / size.max() ** 2 * cells * size.prod()
     if condition != "farthest":  # two of the four points may share cells of so small a bar
         assert grip.stiffness.sum() == pytest.approx(expected)
     np.testing.assert_array_equal(grip.targets(0, STEPS), grip.points)
@@ -73,6 +77,59 @@ def test_both_methods_follow_one_protocol(tmp_path) -> None:
     assert len(list(tmp_path.iterdir())) == 1
     fem_motion(softer, grip, quadrature.points, STEPS, tmp_path)
     assert len(list(tmp_path.iterdir())) == 2
+
+
+@pytest.fixture(scope="module")
+def brick(tmp_path_factory: pytest.TempPathFactory) -> MeshThing:
+    """Return a box of 2 x 1 x 1 m, read from a file that lacks a triangle."""
+    folder = tmp_path_factory.mktemp("meshes")
+    box = trimesh.creation.box(extents=(2.0, 1.0, 1.0))
+    trimesh.Trimesh(box.vertices, box.faces[1:], process=False).export(folder / "brick.obj")
+    (thing,) = meshes.read_folder(folder)
+    return thing
+
+
+def test_meshes_are_closed_scaled_and_held(brick: MeshThing) -> None:
+    """Longest edge 1 m, volume 1/4 m^3; sum k = kappa V of an end of a tenth of the length; ends go apart."""
+    assert np.ptp(brick.vertices, axis=0) == pytest.approx([1.0, 0.5, 0.5])
+    assert brick.quadrature.volume == pytest.approx(0.25)
+    grip = brick.grip("boundary")
+    expected = 2.0 * grips.SPRINGS * brick.youngs_modulus / PART**2 * (0.25 * PART)
+    assert grip.stiffness.sum() == pytest.approx(expected, rel=0.35)  # whole points of a coarse grid
+    np.testing.assert_allclose(np.abs(grip.pull), np.tile([PULL, 0.0, 0.0], (len(grip.points), 1)))
+    assert [len(brick.regions(brick.grip(condition))) for condition in CONDITIONS] == [1, 4, 2]
+
+
+def test_references_are_refined_and_read_again(brick: MeshThing, tmp_path) -> None:
+    """What is stored is what was made, to half a unit of each shape's 16 bits; particles of `mpm` follow it."""
+    path, steps = tmp_path / "references.npz", 2
+    made, count, distance = meshes.refine(brick, "boundary", steps)
+    assert count > meshes.COUNTS[0] and distance <= meshes.STABLE
+    references, size = References(path), np.abs(made).max()
+    key = f"{brick.key}_boundary_{steps}"
+    references.add(key, meshes.packed(made, count, distance))
+    np.testing.assert_allclose(references.motion(brick, "boundary", steps), made, atol=meshes.SHAPES * size / 32767.0)
+    grip = brick.grip("boundary")
+    found = explicit.thing_motion(brick, grip, 0.1, steps)
+    at = np.argmin(np.linalg.norm(brick.quadrature.points[:, None] - brick.points[None, :5], axis=2), axis=0)
+    assert np.abs(found[:, at] - made[:, :5]).max() < 0.2 * size
+
+
+def test_a_folder_without_meshes_is_refused(tmp_path) -> None:
+    """The error says which folder, and where meshes are; a file that is none is named."""
+    with pytest.raises(AssetError, match="no mesh"):
+        meshes.read_folder(tmp_path)
+    (tmp_path / "bad.obj").write_text("v 0 0 0")
+    with pytest.raises(AssetError, match=r"bad\.obj"):
+        meshes.read_folder(tmp_path)
+
+
+def test_wins_count_objects_that_are_not_worse() -> None:
+    """By condition, of those that have both rows."""
+    rows = [{"condition": "fix", "basis": b, "mse": m} for b, m in (("one", 1.0), ("two", 2.0))]
+    records = [{"name": "a", "rows": rows}, {"name": "b", "rows": [dict(r, mse=1.0) for r in rows]}]
+    assert objects.wins(records, "one", "two")["fix"] == "2 of 2"
+    assert objects.wins(records, "two", "one")["fix"] == "1 of 2"
 
 
 @pytest.mark.parametrize(("loss", "sampling"), training.METHODS)

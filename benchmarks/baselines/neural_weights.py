@@ -13,9 +13,9 @@ where Kaolin takes finite differences. One constant handle is added, as there.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -64,7 +64,21 @@ class NeuralWeights:
     bounds: np.ndarray
     """Bounding box that is mapped to the unit cube [m], shape (2, 3)."""
     train_seconds: float
-    """Wall time of the training [s]."""
+    """Wall time of the training [s], of all objects that were trained at once."""
+
+    @classmethod
+    def of(cls, arrays: Mapping[str, np.ndarray]) -> NeuralWeights:
+        """Return the network of `arrays`."""
+        pairs = range((len(arrays) - 2) // 2)
+        layers = [(np.float64(arrays[f"matrix_{k}"]), np.float64(arrays[f"bias_{k}"])) for k in pairs]
+        return cls(layers=layers, bounds=np.float64(arrays["bounds"]), train_seconds=float(arrays["seconds"]))
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return what a file keeps."""
+        found = {"bounds": self.bounds, "seconds": np.array(self.train_seconds)}
+        for k, (matrix, bias) in enumerate(self.layers):
+            found |= {f"matrix_{k}": matrix, f"bias_{k}": bias}
+        return found
 
     def evaluate(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return weights (N, m + 1), the constant one first, and gradients [1/m] (N, m + 1, 3) at points (N, 3) [m]."""
@@ -100,69 +114,113 @@ def train_neural_weights(
     Returns:
         The network.
     """
-    key = fingerprint_of("neural weights", 1, points, volume, options, youngs_modulus, poissons_ratio)
+    key = fingerprint_of("neural weights", 2, points, volume, options, youngs_modulus, poissons_ratio)
     path = cache_directory() / "neural_weights" / f"{key}.npz"
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
-        _train(points, volume, options, youngs_modulus, poissons_ratio, path)
+        (network,) = train_many(
+            [(points, volume)], options, youngs_modulus=youngs_modulus, poissons_ratio=poissons_ratio
+        )
+        with whole_file(path) as file:
+            np.savez(file, **network.arrays())
     with np.load(path) as file:
-        pairs = range((len(file.files) - 2) // 2)
-        layers = [(file[f"matrix_{k}"].astype(np.float64), file[f"bias_{k}"].astype(np.float64)) for k in pairs]
-        return NeuralWeights(layers=layers, bounds=file["bounds"], train_seconds=float(file["seconds"]))
+        return NeuralWeights.of(file)
 
 
-def _train(
-    points: np.ndarray,
-    volume: float,
+def train_many(
+    objects: Sequence[tuple[np.ndarray, float]],
     options: NeuralWeightsOptions,
+    *,
     youngs_modulus: float,
     poissons_ratio: float,
-    path: Path,
-) -> None:
-    """Train and write the file."""
+    device: str = "cpu",
+    report: Callable[[int], object] = lambda iteration: None,
+) -> list[NeuralWeights]:
+    """Train a network for each of several objects, all at once.
+
+    Args:
+        objects: Points that fill each uniformly [m], shape (P, 3), and its volume [m^3].
+        options: Training.
+        youngs_modulus: Young's modulus [Pa].
+        poissons_ratio: Poisson's ratio.
+        device: Of torch.
+        report: Called with the number of every hundredth iteration.
+
+    Returns:
+        A network for each object.
+    """
     import torch
 
     torch.manual_seed(options.seed)
     start = time.perf_counter()
-    bounds = np.stack([points.min(axis=0), points.max(axis=0)])
-    size = torch.tensor(bounds[1] - bounds[0], dtype=torch.float32)
-    unit = torch.tensor((points - bounds[0]) / (bounds[1] - bounds[0]), dtype=torch.float32)
-    if options.unit_cube:
-        scale, volume = torch.ones(3), volume / float(np.prod(bounds[1] - bounds[0]))
-    else:
-        scale = size
+    bounds = [np.stack([points.min(axis=0), points.max(axis=0)]) for points, _ in objects]
+    count, least = options.sample_count, min(len(points) for points, _ in objects)
     mu = youngs_modulus / (2.0 * (1.0 + poissons_ratio))
     lam = youngs_modulus * poissons_ratio / ((1.0 + poissons_ratio) * (1.0 - 2.0 * poissons_ratio))
     widths = [3, *[options.width] * (options.layer_count + 1), options.mode_count]
-    layers = [torch.nn.Linear(a, b) for a, b in pairwise(widths)]
-    optimizer = torch.optim.Adam([p for layer in layers for p in layer.parameters()], options.learning_rate)
-    identity = torch.eye(options.mode_count)
-    for iteration in range(options.iterations):
-        x = unit[torch.randint(len(unit), (options.sample_count,))]
-        weight, slope = _forward(torch, layers, x, torch.diag(1.0 / scale))
-        transform = options.transform_deviation * torch.randn(options.transform_count, options.mode_count, 4, 3)
-        mix = iteration / options.iterations
-        energy = elastic_energy(torch, weight, slope, x * scale, transform, mu, lam, mix)
-        elastic = options.elastic_weight * volume / len(x) * energy.sum()
-        orthogonality = options.orthogonality_weight * ((weight.T @ weight - identity) ** 2).mean()
-        optimizer.zero_grad()
-        (elastic + orthogonality).backward()
-        optimizer.step()
-    arrays: dict[str, Any] = {"bounds": bounds, "seconds": np.array(time.perf_counter() - start)}
-    for k, layer in enumerate(layers):
-        arrays[f"matrix_{k}"], arrays[f"bias_{k}"] = layer.weight.detach().numpy(), layer.bias.detach().numpy()
-    with whole_file(path) as file:
-        np.savez(file, **arrays)
+    with torch.device(device):
+        pool, size, weigh = [], [], []
+        rng = np.random.default_rng(options.seed)
+        for (points, volume), (lower, upper) in zip(objects, bounds, strict=True):
+            rows = rng.permutation(len(points))[:least]
+            pool.append(torch.tensor((points[rows] - lower) / (upper - lower), dtype=torch.float32))
+            size.append(torch.tensor(np.ones(3) if options.unit_cube else upper - lower, dtype=torch.float32))
+            weigh.append(volume / (float(np.prod(upper - lower)) if options.unit_cube else 1.0))
+        unit, scale = torch.stack(pool), torch.stack(size)[:, None]
+        volumes = torch.tensor(weigh, dtype=torch.float32)
+        seed, identity = torch.diag_embed(1.0 / scale), torch.eye(options.mode_count)
+        linear = [[torch.nn.Linear(a, b) for a, b in pairwise(widths)] for _ in objects]
+        layers = [
+            [torch.stack([getattr(own[k], part).detach() for own in linear]).requires_grad_() for part in _PARTS]
+            for k in range(len(widths) - 1)
+        ]
+        optimizer = torch.optim.Adam([p for layer in layers for p in layer], options.learning_rate)
+        each = torch.arange(len(objects))[:, None]
+        for iteration in range(options.iterations):
+            x = unit[each, torch.randint(least, (len(objects), count))]
+            weight, slope = _forward(torch, layers, x, seed)
+            shape = len(objects), options.transform_count, options.mode_count, 4, 3
+            transform = options.transform_deviation * torch.randn(*shape)
+            mix = iteration / options.iterations
+            energy = torch.vmap(lambda *at, mix=mix: elastic_energy(torch, *at, mu, lam, mix))(
+                weight, slope, x * scale, transform
+            )
+            elastic = options.elastic_weight / count * (volumes * energy.sum(dim=(1, 2))).sum()
+            orthogonality = ((weight.transpose(1, 2) @ weight - identity) ** 2).mean(dim=(1, 2)).sum()
+            optimizer.zero_grad()
+            (elastic + options.orthogonality_weight * orthogonality).backward()
+            optimizer.step()
+            if iteration % 100 == 0:
+                report(iteration)
+        trained = [[part.detach().cpu().numpy().astype(np.float64) for part in layer] for layer in layers]
+    seconds = time.perf_counter() - start
+    return [
+        NeuralWeights(layers=[(w[k], b[k]) for w, b in trained], bounds=bounds[k], train_seconds=seconds)
+        for k in range(len(objects))
+    ]
+
+
+_PARTS = "weight", "bias"
 
 
 def _forward(torch: Any, layers: list[Any], x: Any, seed: Any) -> tuple[Any, Any]:
-    """Return weights (N, m) and gradients (N, m, 3), the derivatives carried forward through the layers."""
-    slope = seed.expand(len(x), 3, 3)
-    for layer in layers[:-1]:
-        z = layer(x)
+    """Return weights (B, N, m) and gradients (B, N, m, 3), the derivatives carried forward through the layers.
+
+    Args:
+        torch: The module.
+        layers: Matrices (B, out, in) and biases (B, out).
+        x: Points in the unit cube, (B, N, 3).
+        seed: Derivative of these by the place, (B, 1, 3, 3).
+    """
+    slope = seed.expand(*x.shape, 3)
+    for matrix, bias in layers[:-1]:
+        turned = matrix.transpose(1, 2)
+        z = x @ turned + bias[:, None]
         x = torch.nn.functional.elu(z)
-        slope = torch.exp(torch.clamp(z, max=0.0))[:, None] * (slope @ layer.weight.T)
-    return layers[-1](x), (slope @ layers[-1].weight.T).transpose(1, 2)
+        slope = torch.exp(torch.clamp(z, max=0.0))[:, :, None] * (slope @ turned[:, None])
+    matrix, bias = layers[-1]
+    turned = matrix.transpose(1, 2)
+    return x @ turned + bias[:, None], (slope @ turned[:, None]).transpose(2, 3)
 
 
 def elastic_energy(

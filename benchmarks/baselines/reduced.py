@@ -28,8 +28,9 @@ from softmode.deformables.model.authoring import add_pins, add_reduced_body, reg
 from softmode.deformables.quadrature.quadrature_grid import Quadrature
 from softmode.deformables.quadrature.quadrature_mesh import quadrature_from_mesh
 from softmode.deformables.reduction.build_body import build_body
+from softmode.deformables.reduction.cache import fingerprint_of
 from softmode.deformables.reduction.cubature import select_cubature
-from softmode.deformables.reduction.functions import RawFunctions, affine_first, orthonormalise
+from softmode.deformables.reduction.functions import RANK_TOLERANCE, RawFunctions, affine_first, orthonormalise
 from softmode.deformables.reduction.options import BuildOptions
 from softmode.deformables.solver.options import Integrator, SolverReducedOptions
 from softmode.deformables.solver.solver_reduced import SolverReduced
@@ -60,7 +61,15 @@ def run_softmode(
 
 def run_neural(options: NeuralWeightsOptions, steps: int) -> Row:
     """Bend the beam with weights that a network was trained for."""
-    body = neural_body(options)
+    bounds = SCENE.shape.bounds
+    network = train_neural_weights(
+        _training_points(bounds),
+        float(np.prod(bounds[1] - bounds[0])),
+        options,
+        youngs_modulus=SCENE.youngs_modulus,
+        poissons_ratio=SCENE.poissons_ratio,
+    )
+    body = neural_body(_quadrature(), network, options.mode_count, "beam")
     note = f"trained {body.network.train_seconds:.0f} s; effective weights {body.effective_count:.1f}"
     label = f"m = {options.mode_count}, trained in " + ("the unit cube" if options.unit_cube else "metres")
     return _run(body, steps, exact=False, method="Simplicits' neural weights", label=label, note=note)
@@ -104,20 +113,17 @@ def _products(
     return _skin(mix).products(value, slope, points, length)
 
 
-def neural_body(options: NeuralWeightsOptions) -> NeuralBody:
-    """Train the network, or load it, and reduce the beam by its weights."""
-    quadrature = _quadrature()
-    body = build_body(
-        quadrature, BuildOptions(mode_count=options.mode_count, kernel_count=KERNELS), name="beam", progress=False
-    )
-    bounds = SCENE.shape.bounds
-    network = train_neural_weights(
-        _training_points(bounds),
-        float(np.prod(bounds[1] - bounds[0])),
-        options,
-        youngs_modulus=SCENE.youngs_modulus,
-        poissons_ratio=SCENE.poissons_ratio,
-    )
+def neural_body(
+    quadrature: Quadrature,
+    network: NeuralWeights,
+    mode_count: int,
+    name: str,
+    *,
+    rank_tolerance: float = RANK_TOLERANCE,
+) -> NeuralBody:
+    """Reduce an object by the weights of a network."""
+    options = BuildOptions(mode_count=mode_count, kernel_count=KERNELS)
+    body = build_body(quadrature, options, name=name, progress=False)
     mass = quadrature.weights / quadrature.volume
     points = quadrature.points - body.offset
     weight = network.evaluate(quadrature.points)[0][:, 1:]
@@ -133,13 +139,15 @@ def neural_body(options: NeuralWeightsOptions) -> NeuralBody:
     lead, others = skin.leading[[3, 0, 1, 2]], np.setdiff1d(np.flatnonzero(~skin.translating), skin.leading)
     kept = np.flatnonzero(skin.translating)
     fields = RawFunctions(raw, raw_gradient, mass, mass)
-    free = orthonormalise(fields, lead=np.eye(raw.shape[1])[:, lead], kept=kept, others=others)
+    free = orthonormalise(
+        fields, lead=np.eye(raw.shape[1])[:, lead], kept=kept, others=others, rank_tolerance=rank_tolerance
+    )
     found = affine_first(free, skin.leading, body.length)
     gradient = np.stack([raw_gradient[:, :, d] @ found.transform for d in range(3)], axis=2)
     chosen = select_cubature(quadrature.weights, gradient, body.point_count)
     fields = {f.name: getattr(body, f.name) for f in dataclasses.fields(body)}
     fields |= {
-        "name": "beam, neural weights",
+        "name": f"{name}, neural weights",
         "cubature": BodyCubature(
             points=points[chosen.index],
             weights=chosen.weights,
@@ -149,7 +157,7 @@ def neural_body(options: NeuralWeightsOptions) -> NeuralBody:
         "mean_basis": found.mean,
         "linear_coordinates": found.linear,
         "transform": found.transform,
-        "fingerprint": f"{body.fingerprint} {options}",
+        "fingerprint": fingerprint_of(body.fingerprint, *network.layers[-1]),
     }
     effective = float(spread.sum() ** 2 / (spread**2).sum())
     made = NeuralBody(**fields, network=network, mean=mean, mix=mix, effective_count=effective)

@@ -1,6 +1,7 @@
 """Run FreeForm's tables and figures beside the paper's numbers.
 
-Run: ``python -m benchmarks.freeform [--tables 1 2 3 4 5] [--figures 4 7] [--quick] [--output out/freeform.json]``.
+Run: ``python -m benchmarks.freeform [--tables 1 2 3 4 5] [--figures 4 5 7] [--quick] [--output out/freeform.json]``,
+or ``--tables 2 --figures 6 --meshes FOLDER`` for Table 2 and figure 6 on meshes of your own.
 What is run replaces its part of the output; Table 2 goes on where it was left.
 `benchmarks/freeform/TABLES.md` says what the rows mean. SPH is not run.
 """
@@ -8,18 +9,21 @@ What is run replaces its part of the output; Table 2 goes on where it was left.
 from __future__ import annotations
 
 import argparse
+import functools
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import warp as wp
 from threadpoolctl import threadpool_limits
 
-from benchmarks.freeform import beam, figures, objects, paper, training
+from benchmarks.freeform import beam, figures, objects, overlays, paper, training
+from benchmarks.freeform.meshes import REFERENCES, References
 
 Record = dict[str, Any]
 PICTURES = Path("docs/images")
-SPH = "not run (pysph does not install here as a wheel, and has no model of Kugelstadt et al.)"
+SPH = "not run (pysplishsplash 2.15 and 2.19 crash at import on Linux x86-64)"
 
 
 def cell(value: float | None) -> str:
@@ -36,7 +40,7 @@ def print_table1(rows: list[Record]) -> None:
     for row in sorted(rows, key=lambda row: list(beam.BEAMS).index(row["beam"])):
         family, m = row["beam"].split()[0], row["m"]
         printed = [paper.FREEFORM[family].get(m), paper.SIMPLICITS[family].get(m)]
-        if row["basis"] == "MPM":
+        if "MPM" in row["basis"]:
             printed = [paper.FULL_ORDER["MPM"][family], None]
         elif row["basis"] == "told, exact":
             printed = [None, None]
@@ -52,8 +56,10 @@ def print_table1(rows: list[Record]) -> None:
 def print_table2(records: list[Record]) -> None:
     """Print Table 2."""
     for several, dataset in ((False, "Thingi10K"), (True, "SimReady")):
-        found = objects.means(records, several)
         count = sum(record["several"] == several for record in records)
+        if not count:
+            continue
+        found = objects.means(records, several)
         kind = "several moduli each" if several else "1e5 Pa (organic) or 1e8 Pa"
         print(f"\nTable 2: {count} objects, {kind} ({dataset} cannot be had offline)")
         print("Each condition: nMSE, the same of the worst frame, largest error; the paper's MSE and Max")
@@ -69,6 +75,13 @@ def print_table2(records: list[Record]) -> None:
                 cell(printed[method][c][0]) + cell(printed[method][c][1]) + 12 * " " for c in objects.CONDITIONS
             )
             print(f"{'paper: ' + method:<22}{'':>9}{printed['seconds'][method]:>8.1f}{values}")
+
+
+def print_meshes(records: list[Record]) -> None:
+    """Print Table 2 on meshes, and in how many of them the default is not worse at equal unknowns."""
+    print_table2(records)
+    for first, second in objects.PAIRS:
+        print(f"{second} is not worse than {first}:", objects.wins(records, second, first))
 
 
 def print_table3(rows: list[Record]) -> None:
@@ -110,7 +123,10 @@ def main() -> None:
     """Run what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--tables", type=int, nargs="*", choices=range(1, 6), default=None)
-    parser.add_argument("--figures", type=int, nargs="*", choices=(4, 7), default=None)
+    parser.add_argument("--figures", type=int, nargs="*", choices=(4, 5, 6, 7), default=None)
+    parser.add_argument("--meshes", type=Path, help="Table 2 on the meshes of this folder instead")
+    parser.add_argument("--references", type=Path, default=REFERENCES, help="stored references of meshes")
+    parser.add_argument("--networks", type=Path, help="Simplicits' networks of benchmarks.freeform.simplicits")
     parser.add_argument("--quick", action="store_true", help="a few steps of a few rows, to try")
     parser.add_argument("--print", action="store_true", help="print what is stored, run nothing")
     parser.add_argument("--output", type=Path, default=Path("out/freeform.json"))
@@ -136,19 +152,34 @@ def main() -> None:
                     found.append(row)
                     print(row, flush=True)
                     save(**{f"table{number}": found})
-        if 2 in asked:
+        if 2 in asked and options.meshes:
+            objects.run_meshes(
+                options.meshes,
+                stored.get("meshes", []),
+                lambda found: save(meshes=found),
+                references=References(options.references),
+                networks=options.networks,
+                quick=options.quick,
+            )
+        elif 2 in asked:
             objects.run_objects(stored.get("table2", []), lambda found: save(table2=found), quick=options.quick)
-        for number in () if options.print else ((4, 7) if everything else options.figures or ()):
-            draw = {4: figures.figure4, 7: figures.figure7}[number]
-            save(**{f"figure{number}": draw(PICTURES / f"freeform_figure{number}.png", quick=options.quick)})
+        for number in () if options.print else ((4, 5, 7) if everything else options.figures or ()):
+            draw: dict[int, Callable[..., Any]] = {4: figures.figure4, 5: overlays.figure5, 7: figures.figure7}
+            if number == 6:
+                if options.meshes is None:
+                    parser.error("figure 6 shows meshes: name their folder by --meshes")
+                draw[6] = functools.partial(overlays.figure6, options.meshes)
+            save(**{f"figure{number}": draw[number](PICTURES / f"freeform_figure{number}.png", quick=options.quick)})
             print(f"figure {number}:", stored[f"figure{number}"], flush=True)
     printers = {1: print_table1, 2: print_table2, 3: print_table3, 4: print_table4, 5: print_table5}
     for number in sorted(tables):
-        if f"table{number}" in stored:
+        if number == 2 and options.meshes:
+            print_meshes(stored.get("meshes", []))
+        elif f"table{number}" in stored:
             printers[number](stored[f"table{number}"])
         elif options.print:
             print(f"\nTable {number} is not in {options.output}")
-    for number in (4, 7) if options.print else ():
+    for number in (4, 5, 6, 7) if options.print else ():
         if f"figure{number}" in stored and (everything or number in (options.figures or ())):
             print(f"figure {number}:", stored[f"figure{number}"])
 

@@ -8,9 +8,11 @@ the same stiffness and the same moving targets in both. Every object is scaled t
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +21,16 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from benchmarks.accuracy import FINE_RANK, affine
+from benchmarks.freeform import simplicits
+from benchmarks.freeform.grips import CONDITIONS, DENSITY, DT, GRAVITY, POISSONS_RATIO, PULL, SPRINGS, STEPS, Grip
+from benchmarks.freeform.meshes import MeshThing, References, read_folder
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.body.regions import Region
 from softmode.deformables.body.rkpm import sample_farthest
 from softmode.deformables.materials.material import Material
 from softmode.deformables.materials.material_kernels import MaterialModel
 from softmode.deformables.model.authoring import add_pins, add_reduced_body
+from softmode.deformables.quadrature.quadrature_grid import Quadrature
 from softmode.deformables.reduction.build_body import build_body
 from softmode.deformables.reduction.cache import fingerprint_of
 from softmode.deformables.reduction.options import BuildOptions
@@ -37,6 +43,8 @@ from tests.shape_trials import Voxels, voxelise
 from tests.shapes import SHAPES, Shape
 
 Array = NDArray[np.float64]
+Basis = BuildOptions | Callable[[Any], ReducedBody]
+Motion = Callable[[str, Grip], Array]
 
 ORGANIC = ("bear", "bunny", "hand", "star", "Y", "cluster", "ellipsoid", "torus", "cup", "twisted bar")
 """Objects of 1e5 Pa; the others have 1e8 Pa, as in the paper."""
@@ -47,38 +55,18 @@ HARD = (
 HETEROGENEOUS = ("bear", "bunny", "hand", "star", "torus", "L-shape", "cross", "dumbbell", "cup", "Y")
 """Objects of several moduli: thirds along the longest axis of 1e6, 1e5 and 1e7 Pa."""
 THIRDS = (1.0, 0.1, 10.0)
-POISSONS_RATIO, DENSITY, GRAVITY = 0.45, 1000.0, 9.81
 ELEMENT_LIMIT = 120
 """Elements of an object at most; the grid has as many cells along the longest edge as that allows, 6 to 14."""
-SPRINGS = 30.0
-"""Springs per volume of a held part, times E / cell^2."""
-PULL = 0.15
-"""How far each part is pulled, over the longest edge."""
+EQUAL: dict[str, Basis] = {
+    "FreeForm m = 16": affine(16, rank_tolerance=FINE_RANK),
+    "default, 68": BuildOptions(function_count=68, poissons_ratio=POISSONS_RATIO, cubature_count=408),
+    "FreeForm m = 11": affine(11, rank_tolerance=FINE_RANK),
+    "default, 48": BuildOptions(poissons_ratio=POISSONS_RATIO),
+}
+"""Bases of as many unknowns in pairs, 204 and 144."""
+PAIRS = tuple(itertools.pairwise(EQUAL))[::2]
 TOLD_LABEL, TOLD = "told, m = 8", BuildOptions(mode_count=8, poissons_ratio=POISSONS_RATIO)
 """A body that was told of the springs when it was built."""
-DT, STEPS = 0.01, 30
-CONDITIONS = ("fix", "farthest", "boundary")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Grip:
-    """Springs of one condition."""
-
-    points: Array
-    """Rest points [m], (G, 3)."""
-    stiffness: Array
-    """Of each [N/m], (G,)."""
-    pull: Array
-    """Displacement of its target at the end of the motion [m], (G, 3)."""
-    gravity: float
-    """Gravity against the object's axis [m/s^2]."""
-    part: NDArray[np.intp]
-    """Held part of every point, (G,)."""
-
-    def targets(self, step: int, steps: int) -> Array:
-        """Return where the targets are at the end of a step [m], (G, 3): from rest to rest, smoothly."""
-        t = step / steps
-        return self.points + t * t * (3.0 - 2.0 * t) * self.pull
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,6 +81,26 @@ class Thing:
     """E [Pa]."""
     factors: Array
     """E of every cell over that, (cells,), in the order of `np.argwhere`."""
+
+    @cached_property
+    def quadrature(self) -> Quadrature:
+        """What bodies are built from."""
+        return self.voxels.quadrature(5000)
+
+    @property
+    def stiffness(self) -> Array:
+        """Relative Young's modulus of the quadrature points, (P,)."""
+        return self.factors_at(self.quadrature.points)
+
+    @property
+    def points(self) -> Array:
+        """Where motions are compared [m], (P, 3)."""
+        return self.quadrature.points
+
+    @property
+    def weights(self) -> Array:
+        """What these count, (P,)."""
+        return self.quadrature.weights
 
     @property
     def down(self) -> Array:
@@ -220,7 +228,9 @@ def _simulate_fem(thing: Thing, grip: Grip, mesh: Mesh, steps: int) -> Array:
     return np.array(frames)
 
 
-def reduced_motion(thing: Thing, grip: Grip, body: ReducedBody, points: Array, steps: int) -> tuple[Array, float, int]:
+def reduced_motion(
+    thing: Thing | MeshThing, grip: Grip, body: ReducedBody, points: Array, steps: int
+) -> tuple[Array, float, int]:
     """Return softmode's displacements (steps, P, 3) [m], processor time per step [ms] and status bits."""
     material = Material(
         model=MaterialModel.STABLE_NEO_HOOKEAN,
@@ -274,10 +284,15 @@ def compare(found: Array, expected: Array, weights: Array) -> Error:
     )
 
 
-def run_thing(thing: Thing, bases: dict[str, BuildOptions], folder: Path | None, steps: int = STEPS) -> dict[str, Any]:
-    """Run all conditions of an object with every basis; return a record."""
-    quadrature = thing.voxels.quadrature(5000)
-    points, stiffness = quadrature.points, thing.factors_at(quadrature.points)
+def run_thing(thing: Thing | MeshThing, bases: dict[str, Basis], motion: Motion, steps: int = STEPS) -> dict[str, Any]:
+    """Run all conditions of an object with every basis; return a record.
+
+    Args:
+        thing: The object.
+        bases: Options of a build, or what makes a body, by label.
+        motion: Gives the reference's displacements at the object's points, (steps, P, 3).
+        steps: Number of steps.
+    """
     bodies = {}
     record: dict[str, Any] = {
         "name": thing.name,
@@ -286,15 +301,20 @@ def run_thing(thing: Thing, bases: dict[str, BuildOptions], folder: Path | None,
         "youngs_modulus": thing.youngs_modulus,
         "rows": [],
     }
-    for label, options in bases.items():
+
+    def built(options: BuildOptions, regions: Sequence[Region] = ()) -> ReducedBody:
+        given = {"regions": regions, "stiffness_scale": thing.stiffness, "name": thing.name, "progress": False}
+        return build_body(thing.quadrature, options, **given)
+
+    for label, basis in bases.items():
         start = time.process_time()
-        bodies[label] = build_body(quadrature, options, stiffness_scale=stiffness, name=thing.name, progress=False)
+        bodies[label] = built(basis) if isinstance(basis, BuildOptions) else basis(thing)
         record[f"seconds {label}"] = time.process_time() - start
     for condition in CONDITIONS:
         grip = thing.grip(condition)
         start = time.process_time()
         try:
-            expected = fem_motion(thing, grip, points, steps, folder)
+            expected = motion(condition, grip)
         except ConvergenceError as error:
             print(f"{thing.name:<18}{len(thing.factors):>5} {condition:<10} no reference: {error}", flush=True)
             record["no_reference"] = [*record.get("no_reference", []), condition]
@@ -302,13 +322,11 @@ def run_thing(thing: Thing, bases: dict[str, BuildOptions], folder: Path | None,
         fem_seconds = time.process_time() - start
         line, moved = f"{thing.name:<18}{len(thing.factors):>5} {condition:<10}", 0.0
         start = time.process_time()
-        told = build_body(
-            quadrature, TOLD, regions=thing.regions(grip), stiffness_scale=stiffness, name=thing.name, progress=False
-        )
+        told = built(TOLD, thing.regions(grip))
         record[f"seconds {TOLD_LABEL}"] = time.process_time() - start
         for label, body in (bodies | {TOLD_LABEL: told}).items():
-            found, milliseconds, status = reduced_motion(thing, grip, body, points, steps)
-            error = compare(found, expected, quadrature.weights)
+            found, milliseconds, status = reduced_motion(thing, grip, body, thing.points, steps)
+            error = compare(found, expected, thing.weights)
             row = {"condition": condition, "basis": label, "unknowns": 3 * body.function_count, "ms": milliseconds}
             record["rows"].append(row | {"status": status, "fem_seconds": fem_seconds} | dataclasses.asdict(error))
             moved = error.moved
@@ -321,19 +339,56 @@ def run_objects(
     stored: list[dict[str, Any]], save: Callable[[list[dict[str, Any]]], Any], *, quick: bool = False
 ) -> list[dict[str, Any]]:
     """Run all objects that are not stored yet; `save` is called after each."""
-    bases = {
+    bases: dict[str, Basis] = {
         "FreeForm m = 16": affine(16, rank_tolerance=FINE_RANK),
         "default, 48": BuildOptions(poissons_ratio=POISSONS_RATIO),
     }
     work = [(name, False) for name in (*ORGANIC, *HARD)] + [(name, True) for name in HETEROGENEOUS]
     if quick:
         work = [("dumbbell", False), ("dumbbell", True)]
+    steps = 10 if quick else STEPS
     print(f"{'object':<18}{'cells':>5} {'condition':<10}", *[f"{label:>18}" for label in (*bases, TOLD_LABEL)])
     for name, several in work:
         if not any(r["name"] == name and r["several"] == several for r in stored):
             thing = make_thing(name, several=several)
-            stored = [*stored, run_thing(thing, bases, Path("out/freeform_fem"), 10 if quick else STEPS)]
+
+            def motion(_: str, grip: Grip, thing: Thing = thing) -> Array:
+                return fem_motion(thing, grip, thing.points, steps, Path("out/freeform_fem"))
+
+            stored = [*stored, run_thing(thing, bases, motion, steps)]
             save(stored)
+    return stored
+
+
+def run_meshes(
+    folder: Path,
+    stored: list[dict[str, Any]],
+    save: Callable[[list[dict[str, Any]]], Any],
+    *,
+    references: References,
+    networks: Path | None = None,
+    quick: bool = False,
+) -> list[dict[str, Any]]:
+    """Run the meshes of a folder that are not stored yet; `save` is called after each.
+
+    Args:
+        folder: The meshes.
+        stored: Records that there are.
+        save: Takes all records.
+        references: Where references are stored.
+        networks: Simplicits' weights by name of the mesh, of `python -m benchmarks.freeform.simplicits`.
+        quick: A few steps of the first mesh.
+    """
+    steps = 3 if quick else STEPS
+    for thing in read_folder(folder)[: 1 if quick else None]:
+        if any(record["name"] == thing.name for record in stored):
+            continue
+        bases = dict(EQUAL)
+        if networks is not None and (found := simplicits.stored_body(networks, thing.name)) is not None:
+            bases["Simplicits m = 16"] = found
+        record = run_thing(thing, bases, lambda condition, _, t=thing: references.motion(t, condition, steps), steps)
+        stored = [*stored, record]
+        save(stored)
     return stored
 
 
@@ -346,3 +401,18 @@ def means(records: list[dict[str, Any]], several: bool) -> dict[tuple[str, str],
                 found.setdefault((row["basis"], row["condition"]), []).append(row)
     keys = ("mse", "worst_frame", "largest", "unknowns", "ms", "moved")
     return {pair: {key: float(np.mean([row[key] for row in rows])) for key in keys} for pair, rows in found.items()}
+
+
+def wins(records: list[dict[str, Any]], basis: str, other: str) -> dict[str, str]:
+    """Return by condition in how many objects, and of how many, the nMSE of a basis is not larger than another's."""
+    found = {}
+    for condition in CONDITIONS:
+        mse = {
+            (record["name"], row["basis"]): row["mse"]
+            for record in records
+            for row in record["rows"]
+            if row["condition"] == condition
+        }
+        names = [name for name, label in mse if label == other]
+        found[condition] = f"{sum(mse[name, basis] <= mse[name, other] for name in names)} of {len(names)}"
+    return found

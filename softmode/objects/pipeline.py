@@ -34,7 +34,7 @@ from softmode.stages import stage
 
 Array = NDArray[np.float64]
 
-RECIPE = 9
+RECIPE = 10
 """Part of the cache key; raise it when the way from a file or shape to a body changes."""
 MISSED_LEAST = 1.0e-3
 """Share of an object that a field of material misses from which on that is said."""

@@ -26,7 +26,7 @@ from softmode.objects.stage_asset import colored_mesh
 from softmode.splats.mesh_samples import sample_mesh
 from softmode.splats.splats import Splats
 
-RECIPE = 4
+RECIPE = 5
 """Raise it when a stage's body comes to be built in another way: cached bodies are keyed by it."""
 _COVER = 8000
 """Points on a mesh that is not closed, whose inside is then what they enclose."""

@@ -179,7 +179,7 @@ def shape_functions(local: Array) -> tuple[Array, Array]:
 
 
 class Mesh:
-    """Hexahedra on the solid cells of a tensor grid, optionally mapped.
+    """Hexahedra on the solid cells of a tensor grid, optionally mapped; 27 Gauss points each, or those of a subclass.
 
     Args:
         lines: Grid lines of the three axes in reference coordinates [m].
@@ -188,6 +188,9 @@ class Mesh:
             within an element to be represented exactly.
         to_reference: Its inverse.
     """
+
+    reach = 0.05
+    """How far a point may lie outside of its element, over half of the largest edge."""
 
     def __init__(
         self,
@@ -244,14 +247,14 @@ class Mesh:
         """Return the matrix (P, N) that takes nodal values to rest points (P, 3) [m].
 
         A point outside takes the nearest element, whose functions go on beyond it: quadrature points of a cell that a
-        sloping face cuts may lie a twentieth of a cell outside.
+        sloping face cuts may lie a twentieth of half a cell outside.
         """
         x = self.to_reference(np.asarray(points, float))
         centre, half = 0.5 * (self.lower + self.upper), 0.5 * (self.upper - self.lower)
         near = KDTree(centre).query(x, k=min(12, len(centre)))[1].reshape(len(x), -1)
         excess = (np.abs(x[:, None] - centre[near]) - half[near]).max(axis=2)
         best = near[np.arange(len(x)), excess.argmin(axis=1)]
-        if excess.min(axis=1).max() > 0.05 * half.max():
+        if excess.min(axis=1).max() > self.reach * half.max():
             raise ValueError(f"points: row {int(excess.min(axis=1).argmax())} lies outside the mesh")
         values = shape_functions((x - centre[best]) / half[best])[0]
         rows = np.repeat(np.arange(len(x)), 27)
@@ -323,7 +326,8 @@ class Solid:
         """Return int factor N_a N_b dV as a sparse (N, N) matrix; factor per quadrature point (E, 27)."""
         mesh, count = self.mesh, len(self.mesh.nodes)
         weight = mesh.weights * factor
-        block = np.einsum("eq,qa,qb->eab", weight, mesh.values, mesh.values, optimize=True)
+        at = "qa" if mesh.values.ndim == 2 else "eqa"
+        block = np.einsum(f"eq,{at},{at[:-1]}b->eab", weight, mesh.values, mesh.values, optimize=True)
         row, column = np.repeat(mesh.elements, 27, axis=1), np.tile(mesh.elements, (1, 27))
         return sparse.csr_matrix((block.ravel(), (row.ravel(), column.ravel())), shape=(count, count))
 
@@ -344,8 +348,8 @@ class Solid:
         mesh = self.mesh
         stress = self.energy.stress(self.deformation_gradient(x)) * mesh.weights[:, :, None, None]
         count = len(mesh.elements)
-        G = mesh.gradients.transpose(0, 2, 1, 3).reshape(count, 27, 81)  # (e, a, q k)
-        local = G @ stress.transpose(0, 1, 3, 2).reshape(count, 81, 3)
+        G = mesh.gradients.transpose(0, 2, 1, 3).reshape(count, 27, -1)  # (e, a, q k)
+        local = G @ stress.transpose(0, 1, 3, 2).reshape(count, -1, 3)
         out = np.empty_like(x)
         flat = mesh.elements.ravel()
         for c in range(3):
@@ -361,9 +365,9 @@ class Solid:
             H = (vector * np.maximum(value, 0.0)[..., None, :]) @ np.swapaxes(vector, -1, -2)
         H *= mesh.weights[:, :, None, None]
         count = len(mesh.elements)
-        half = H.reshape(count, 27, 27, 3) @ mesh.gradients.transpose(0, 1, 3, 2)  # (e, q, [i k j], b)
-        half = half.reshape(count, 27, 3, 3, 3, 27).transpose(0, 1, 3, 2, 4, 5).reshape(count, 81, 243)
-        G = mesh.gradients.transpose(0, 2, 1, 3).reshape(count, 27, 81)
+        half = H.reshape(count, -1, 27, 3) @ mesh.gradients.transpose(0, 1, 3, 2)  # (e, q, [i k j], b)
+        half = half.reshape(count, -1, 3, 3, 3, 27).transpose(0, 1, 3, 2, 4, 5).reshape(count, -1, 243)
+        G = mesh.gradients.transpose(0, 2, 1, 3).reshape(count, 27, -1)
         K = (G @ half).reshape(count, 27, 3, 3, 27)  # (e, a, i, j, b)
         return K.transpose(0, 1, 2, 4, 3).reshape(count, 81, 81)
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from softmode.deformables.body.qgmls import BasisQGMLS
 from softmode.deformables.body.raw_functions import QuadraticFunctions
 from softmode.deformables.body.regions import Envelope, Region
-from softmode.deformables.body.rkpm import BasisRKPM, ShapeFunctions, make_basis
+from softmode.deformables.body.rkpm import BasisRKPM, ShapeFunctions, make_basis, sample_farthest
 from softmode.deformables.body.skinning_weights import SkinningWeights, constant_handle, enveloped
 from softmode.deformables.quadrature.octants import Octants
 from softmode.deformables.reduction.eigenmodes import Eigenmodes, solve_eigenmodes
@@ -21,6 +21,7 @@ from softmode.deformables.reduction.elastic_functions import (
     TURN_COUNT,
     ElasticChoice,
     Held,
+    Pulled,
     choose_functions,
 )
 from softmode.deformables.reduction.functions import (
@@ -64,6 +65,9 @@ plate gave way in its plane 4 % too far, between the points."""
 KERNEL_POINTS, MODE_POINTS = 3, 32
 """Free quadrature points for each kernel that acts among them, and for each quadratic eigenmode, where exact regions
 hold the rest: with fewer, displacements hide between points. Ten millimetres between two clamps were half as stiff."""
+FAR_COUNT, FAR_REACH, FAR_LEVEL = 4, 0.1, 0.5
+"""So many farthest points of a free body are pulled, with all within so much of the longest edge, and weigh so many
+times unit energy; its two ends weigh one."""
 THIN = 0.7
 """A held body that has room for fewer kernels than this fraction of those asked for is thin, as plates and strips of
 50:1, and wants the large space: it is made at once, which takes a quarter less time."""
@@ -92,6 +96,8 @@ class Domain:
     """Relative lambda + 4 mu, the weight of the eigenmodes, shape (P,)."""
     density: Array
     """Relative density of volume mean one, shape (P,)."""
+    surface: Array
+    """Points of the surface [m], shape (N, 3)."""
     seeds: Array
     """Points among which kernel centres are chosen [m], shape (S, 3)."""
     spacing: float
@@ -417,7 +423,24 @@ def _chosen(
         held=Held(driven=driven, motions=motions, springs=springs, turned=turned, level=level)
         if domain.regions
         else None,
+        pulled=() if domain.regions else _pulled_parts(raw, domain),
     )
+
+
+def _pulled_parts(raw: RawFunctions, domain: Domain) -> tuple[list[Pulled], list[Pulled]]:
+    """Return the parts of a free body that are pulled apart: around its farthest points, and its two ends."""
+    surface, points, fraction = domain.surface, domain.points, domain.volumes / domain.volumes.sum()
+    first = int((surface**2).sum(axis=1).argmax())
+    far = [np.linalg.norm(points - x, axis=1) for x in surface[sample_farthest(surface, FAR_COUNT, first=first)]]
+    axis = int(np.argmax(np.ptp(surface, axis=0)))
+    size = float(np.ptp(surface[:, axis]))
+    ends = [points[:, axis] - surface[:, axis].min(), surface[:, axis].max() - points[:, axis]]
+
+    def part(distance: Array, level: float) -> Pulled:
+        near = distance <= max(FAR_REACH * size, distance.min())
+        return Pulled(raw.value[near], fraction[near] / size**2, level)
+
+    return [part(distance, FAR_LEVEL) for distance in far], [part(distance, 1.0) for distance in ends]
 
 
 def _finished(

@@ -21,9 +21,9 @@ from softmode.deformables.quadrature.quadrature_grid import Quadrature
 from softmode.deformables.reduction.basis import BodyBasis, Domain, make_body_basis
 from softmode.deformables.reduction.cache import cache_directory, cached_body, fingerprint_of
 from softmode.deformables.reduction.cubature import POISSON_RATIO, Cubature, select_cubature
-from softmode.deformables.reduction.elastic_functions import EXCESS, EXCESS_WARNING
+from softmode.deformables.reduction.elastic_functions import EXCESS, EXCESS_WARNING, FAR_AFTER
 from softmode.deformables.reduction.kernel_visibility import lips_of, material_of
-from softmode.deformables.reduction.options import FUNCTION_COUNT, BuildOptions, HandleName
+from softmode.deformables.reduction.options import FUNCTION_COUNT, FUNCTION_LIMIT, BuildOptions, HandleName
 from softmode.deformables.reduction.region_samples import longest_edge, pieces_near, refine_at_faces, sample_regions
 from softmode.deformables.reduction.sources import Sources, pack_sources
 from softmode.errors import ConfigError, MaterialError, memory_errors
@@ -48,6 +48,8 @@ Field = ArrayLike | Callable[[Array], ArrayLike]
 
 FREE_VERSION = 3
 """Version of the format since which bodies without regions are what they are: live recordings name them by it."""
+PULLED_VERSION = 6
+"""That of those with more functions than `FAR_AFTER`, which since then serve pulls."""
 NU_LIMIT = 0.495
 """Poisson's ratio from which on the default number of functions is said to be too small."""
 _PROGRESS = {"kernels": 0.1, "eigenmodes": 0.2, "responses": 0.35, "functions": 0.45, "cubature": 0.95, "surface": 1.0}
@@ -185,6 +187,7 @@ def _build(
                 lame_ratio=lame_ratio,
                 scalar_stiffness=scalar,
                 density=density[parent],
+                surface=quadrature.surface_points - offset,
                 seeds=seeds,
                 spacing=quadrature.spacing,
                 edge=longest_edge(quadrature),
@@ -302,7 +305,9 @@ def body_fingerprint(
     ratio: Array | None = None,
 ) -> str:
     """Return the fingerprint of all that a body is built from; stiffness and density are relative, one per point."""
-    version, varied = FORMAT_VERSION if regions else FREE_VERSION, () if ratio is None else (ratio,)
+    most = FUNCTION_LIMIT if options.accuracy is not None else options.function_count or FUNCTION_COUNT
+    free = PULLED_VERSION if options.chosen and most > FAR_AFTER else FREE_VERSION
+    version, varied = FORMAT_VERSION if regions else free, () if ratio is None else (ratio,)
     return fingerprint_of(version, quadrature, options, name, list(regions), stiffness, density, *varied)
 
 
