@@ -202,7 +202,7 @@ def lie_and_lift(device: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     env.reset(seed=1)
     _, infos = env.reset(seed=2)
     assert len(set(infos["object"].tolist())) == len(KINDS)
-    scene, still = env.task.scene, np.zeros(env.action_space.shape, np.float32)
+    scene, still = env.task.scene, np.zeros((16, 5), np.float32)
     for _ in range(30):
         *_, infos = env.step(still)
         assert not infos["end_reason"].any()
