@@ -31,8 +31,9 @@ PREAMBLE = """# Tasks and methods
 
 How often a method succeeds in a task, with its 95 % interval (Wilson), and how often it does so within the
 [limits of force and strain](environments.md#gentle-hands). Episodes are whole ones on seeds that training does not use,
-in the task's default ranges; policies act without noise. Steps and time are those of the training. What was not run is
-empty and has its command; what does not apply has the reason. A policy's range is measured by
+in the task's default ranges or those of its command; policies act without noise. Steps and time are those of the
+training. What was not run is empty and has its command; what does not apply has the reason. A policy's range is
+measured by
 `python -m benchmarks.robustness policies/lift_soft_robust.npz`.
 
 This page is written by `python -m benchmarks.tasks` from `docs/data/tasks.csv`.
