@@ -97,7 +97,8 @@ def play(task: str, policy: str, episodes: int, seed: int, device: str | None) -
     from softmode.learning.policy import load_policy
 
     trained = None if policy == "scripted" else load_policy(policy)
-    options: dict[str, Any] = {} if trained is None else with_config(trained.env, trained.env_options)
+    whole = {"terminate_when_rough": False}
+    options: dict[str, Any] = {} if trained is None else with_config(trained.env, {**trained.env_options, **whole})
     env: Any = gym.make_vec(IDS[task], num_envs=episodes, autoreset_mode="Disabled", device=device, **options)
     player: Any = scripted_policy(env) if trained is None else trained
     observation, _ = env.reset(seed=seed)
