@@ -31,8 +31,9 @@ PREAMBLE = """# Tasks and methods
 
 How often a method succeeds in a task, with its 95 % interval (Wilson), and how often it does so within the
 [limits of force and strain](environments.md#gentle-hands). Episodes are whole ones on seeds that training does not use,
-in the task's default ranges; policies act without noise. Steps and time are those of the training. What was not run is
-empty and has its command; what does not apply has the reason. A policy's range is measured by
+in the task's default ranges or those of its command; policies act without noise. Steps and time are those of the
+training. What was not run is empty and has its command; what does not apply has the reason. A policy's range is
+measured by
 `python -m benchmarks.robustness policies/lift_soft_robust.npz`.
 
 This page is written by `python -m benchmarks.tasks` from `docs/data/tasks.csv`.
@@ -96,7 +97,8 @@ def play(task: str, policy: str, episodes: int, seed: int, device: str | None) -
     from softmode.learning.policy import load_policy
 
     trained = None if policy == "scripted" else load_policy(policy)
-    options: dict[str, Any] = {} if trained is None else with_config(trained.env, trained.env_options)
+    whole = {"terminate_when_rough": False}
+    options: dict[str, Any] = {} if trained is None else with_config(trained.env, {**trained.env_options, **whole})
     env: Any = gym.make_vec(IDS[task], num_envs=episodes, autoreset_mode="Disabled", device=device, **options)
     player: Any = scripted_policy(env) if trained is None else trained
     observation, _ = env.reset(seed=seed)

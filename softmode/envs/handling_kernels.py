@@ -184,6 +184,7 @@ def judge(
     handling.safe[w] = result.success[w] and gently
     if terminates != 0 and not gently:
         result.failure[w] = EndReason.ROUGH
+        result.success[w] = False
 
 
 @wp.kernel

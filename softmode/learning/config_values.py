@@ -72,20 +72,10 @@ def with_config(env: str, options: dict[str, Any]) -> dict[str, Any]:
     """
     if not isinstance(options.get("config"), dict) or not is_soft(env):
         return options
-    kind, given, rest = config_class(env), options["config"], dict(options)
-    if rest.get("preset") is not None:
-        given = _merged(values_of(kind.preset(rest.pop("preset")), kind()), given)
-    return {**rest, "config": config_of(kind, given)}
-
-
-def _merged(values: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
-    """Return JSON values with others in their place, dicts field by field."""
-    both = {name: _merged(values[name], value) for name, value in over.items() if _are_dicts(values.get(name), value)}
-    return {**values, **over, **both}
-
-
-def _are_dicts(*values: Any) -> bool:
-    return all(isinstance(value, dict) for value in values)
+    kind, rest = config_class(env), dict(options)
+    preset = rest.pop("preset", None)
+    start = None if preset is None else kind.preset(preset)
+    return {**rest, "config": config_of(kind, options["config"], start)}
 
 
 def split_config(env: str, options: dict[str, Any]) -> tuple[TaskConfig, dict[str, Any]]:

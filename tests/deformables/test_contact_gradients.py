@@ -12,9 +12,10 @@ from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.gradients.adjoint import AdjointOptions, AdjointReduced
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body
+from softmode.deformables.model.namespaces import soft
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from softmode.errors import ConfigError, SolverDiverged
-from tests.bodies import cube, smooth_ball
+from tests.bodies import cube, default_cube, smooth_ball
 from tests.scenes import GRAVITY, Scene
 
 EXACT = SolverReducedOptions(tolerance=1.0e-12, force_tolerance=1.0e-12, iteration_max=100, friction_lag=100)
@@ -259,36 +260,51 @@ def test_frozen_normal_force_is_named() -> None:
         case.adjoint.backward(loss_q=case.weight)
 
 
+def land(shape: str, youngs_modulus: float = 1.0e6, **options: bool) -> tuple[AdjointReduced, np.ndarray]:
+    """Return the record of a step of a cube that is in a shape, and where it then is."""
+    edge = shape == "edge"
+    body = default_cube() if edge else cube()
+
+    def populate(world: newton.ModelBuilder) -> None:
+        material = Material(youngs_modulus=youngs_modulus, friction=0.0)
+        add_reduced_body(world, body, material=material, position=(0.0, 0.0, 0.047))
+        turn = wp.quat_from_axis_angle(wp.vec3(0.0, 1.0, 0.0), 0.25 * np.pi if edge else 0.0)
+        below = wp.transform(wp.vec3(0.002, 0.0, -0.2 * (2.0**0.5 if edge else 1.0)), turn)
+        if shape == "sphere":
+            world.add_shape_sphere(-1, xform=below, radius=0.2)
+        else:
+            world.add_shape_box(-1, xform=below, hx=0.2, hy=0.2, hz=0.2)
+
+    scene = Scene(populate, [body], gravity=(0.0, 0.0, -GRAVITY), options=EXACT)
+    exact = AdjointOptions(residual_warning=1.0e-9, residual_max=1.0e-9, **options)
+    adjoint = AdjointReduced(scene.reduced, 1, options=exact)
+    adjoint.start(scene.state)
+    adjoint.step(scene.state, scene.next_state, None, DT)
+    assert scene.reduced.instance_force.numpy()[0, 2] > 0.0
+    return adjoint, soft(scene.next_state).q.numpy()
+
+
 def test_a_normal_that_turns_is_refused() -> None:
     """On a sphere or an edge the normal turns: refused unless it is taken for fixed. On the face of a box it does not.
 
-    What the edge of a box presses is restored as it was: the recorded step is at its root.
+    What the edge of a box presses is restored as it was, centres of pressure too: the recorded step is at its root.
+    And it follows E, by differences, where the penalty of the faces has its floor and does not.
     """
-    body = cube()
 
-    def gradients(shape: str, **options: bool) -> dict[str, np.ndarray]:
-        def populate(world: newton.ModelBuilder) -> None:
-            add_reduced_body(world, body, material=Material(friction=0.0), position=(0.0, 0.0, 0.047))
-            edge = shape == "edge"
-            turn = wp.quat_from_axis_angle(wp.vec3(0.0, 1.0, 0.0), 0.25 * np.pi if edge else 0.0)
-            below = wp.transform(wp.vec3(0.002, 0.0, -0.2 * (2.0**0.5 if edge else 1.0)), turn)
-            if shape == "sphere":
-                world.add_shape_sphere(-1, xform=below, radius=0.2)
-            else:
-                world.add_shape_box(-1, xform=below, hx=0.2, hy=0.2, hz=0.2)
-
-        scene = Scene(populate, [body], gravity=(0.0, 0.0, -GRAVITY), options=EXACT)
-        adjoint = AdjointReduced(scene.reduced, 1, options=AdjointOptions(**options))
-        adjoint.start(scene.state)
-        adjoint.step(scene.state, scene.next_state, None, DT)
-        assert scene.reduced.instance_force.numpy()[0, 2] > 0.0
-        return adjoint.backward(loss_q=np.ones((2, adjoint.total, 3))).numpy()
+    def gradients(shape: str, modulus: float = 1.0e6, **options: bool) -> dict[str, np.ndarray]:
+        adjoint, _ = land(shape, modulus, **options)
+        weight = np.ones((2, adjoint.total, 3)) * np.array([0.0, 1.0])[:, None, None]
+        return adjoint.backward(loss_q=weight).numpy()
 
     gradients("box")
     for shape in ("sphere", "edge"):
         with pytest.raises(ConfigError, match="fixed_normals=True"):
             gradients(shape)
-        gradients(shape, fixed_normals=True)
+    gradients("sphere", fixed_normals=True)
+    modulus, step = 2.0e4, 1.0e-3
+    ends = [land("edge", modulus * (1.0 + side))[1].sum() for side in (-step, step)]
+    found = modulus * gradients("edge", modulus, fixed_normals=True)["youngs_modulus"]
+    assert found == pytest.approx((ends[1] - ends[0]) / (2.0 * step), rel=1.0e-3)
 
 
 def test_deep_overlap_is_refused() -> None:

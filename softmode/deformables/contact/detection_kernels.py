@@ -650,6 +650,7 @@ def gather_contacts(
         cell = cell_at(cell_shape, ahead, normal, gap, closing, ratio)
         turned = wp.dot(normal, (ahead - start) * cell.centre)
         ridge = wp.float64(0.0)
+        ridge_lead = wp.float64(0.0)
         if shapes.kind[shape] == BOX:
             found = float(samples.gap[i, s, slot])
             length, deep, inward = ridge_of(instances, basis, motion, shapes, samples, i, row, shape, found)
@@ -663,8 +664,9 @@ def gather_contacts(
                 push = wp.max(face - least, wp.float64(0.1) * cell_shape.least)  # of the face too where it is far
                 push /= wp.float64(1.0) + stiffness * compliance
                 normal = wp.normalize(push * normal + ridge * wp.max(edge - least, wp.float64(0.0)) * inward)
-                constraints.ridge_lead[i, e] = edge - face
+                ridge_lead = edge - face
         constraints.ridge[i, e] = ridge
+        constraints.ridge_lead[i, e] = ridge_lead  # always: nan from a step before would be felt, as 0 times it is nan
         # both bodies feel the force at one point, not the shape at its own surface: a pair of forces on two
         # points would make angular momentum out of friction times penetration
         point = wp.vec3(samples.position[i, s] + start * cell.centre)

@@ -649,6 +649,7 @@ def write_pairs(
             constraints.onset[a, e] = cell.onset
             constraints.lead[a, e] = cell.lead
             constraints.ridge[a, e] = wp.float64(0.0)
+            constraints.ridge_lead[a, e] = wp.float64(0.0)
             constraints.friction[a, e] = friction
 
 

@@ -47,7 +47,8 @@ def face_beside_edge(half: wp.vec3d, x: wp.vec3d, gap: float, side: float):
         if away > wp.abs(x[axis]) - half[axis]:
             axis = k
     nearest = float(wp.abs(x[axis]) - half[axis])
-    return wp.where(count > 1 and outside < 2 and wp.abs(nearest - gap) < 2.0e-6, axis, -1)
+    rounding = 2.0e-6 * wp.max(1.0, float(wp.max(half)))  # of distances in float32
+    return wp.where(count > 1 and outside < 2 and wp.abs(nearest - gap) < rounding, axis, -1)
 
 
 @wp.func

@@ -190,7 +190,7 @@ class AdjointReduced:
         self._constraint = {name: self._zeros((step_max, *constraints), kind) for name, kind in kinds.items()}
 
         samples, touched = (step_max, *t.samples.shape.shape), self.solver.model.shape_count > 0
-        kinds = {"shape": int, "gap": wp.float64} if touched else {}
+        kinds = {"shape": int, "gap": wp.float64, "normal": wp.vec3} if touched else {}
         self._sample = {name: self._zeros(samples, kind) for name, kind in kinds.items()}
 
         self._sizes = {

@@ -53,7 +53,7 @@ class Linearised:
     point: wp.array2d[wp.mat33d]  # V times what is summed over the points next [N m]
     constraint_slip: wp.array2d[wp.vec3d]  # pins: x - target [m]; contacts: -d force / d friction coefficient [N]
     constraint_normal: wp.array2d[wp.vec3d]  # contacts: d force / d normal force
-    constraint_gain: wp.array2d[wp.vec2d]  # contacts: d normal force / d ln of stiffness, dent compliance [N]
+    constraint_gain: wp.array2d[wp.vec3d]  # contacts: d normal force / d ln of stiffness, dent compliance, edges [N]
     constraint_hessian: wp.array2d[wp.mat33d]  # -d force / d displacement [N/m]; not symmetric where a contact slips
     constraint: wp.array2d[wp.vec3d]  # what is summed over the constraints next [N]
     memory: wp.array2d[wp.vec3d]  # what the next step feels of a contact's memory, over the stick stiffness
@@ -232,7 +232,9 @@ def place_constraints(
     step.constraint_slip[i, e] = k * slope * by_limit * t
     step.constraint_normal[i, e] = n - c * by_limit * t
     by_ratio = -ratio / ((wp.float64(1.0) + ratio) * (wp.float64(1.0) + ratio)) * plain_slope
-    step.constraint_gain[i, e] = k * wp.vec2d(slope + by_ratio, by_ratio)
+    _edge, edge_slope, _curvature = penalty(p + constraints.ridge_lead[i, e], constraints.onset[i, e])
+    by_edge = constraints.ridge[i, e] * edge_slope
+    step.constraint_gain[i, e] = k * wp.vec3d(slope - by_edge + by_ratio, by_ratio, by_edge)
     step.constraint_hessian[i, e] = k * curvature * N + slip - c * k * curvature * by_limit * wp.outer(t, n)
 
 
@@ -539,7 +541,7 @@ def accumulate_constraints(
     steep = beyond_exponent(constraints.stiffness[i, e] * constraints.dent_compliance[i, e])
     dent_powers = steep * dent_exponents(instances, i) + (steep - wp.float64(1.0)) * stiffness_powers
     by = step.constraint_gain[i, e]
-    normal_gain = by[0] * stiffness_powers + by[1] * dent_powers
+    normal_gain = by[0] * stiffness_powers + by[1] * dent_powers - by[2] * dent_exponents(instances, i)
     # k_t is that of the spring of friction and of the dent along the surface in series
     yields = constraints.stick[i, e] * shear_yield(instances, i, constraints.dent_compliance[i, e])
     deep_powers = stiffness_exponents(instances, i, SHEAR_FACTOR, relative, partner_area, dt)

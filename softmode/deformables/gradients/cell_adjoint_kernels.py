@@ -63,6 +63,17 @@ def gap_of(instances: Instances, samples: Samples, i: int, sample: int, shape: i
 
 
 @wp.func
+def normal_of(instances: Instances, samples: Samples, i: int, sample: int, shape: int):
+    """Return the normal of a shape at a sample, which its cell is found with; edges turn that of the contact."""
+    s = sample - instances.row_start[i]
+    normal = samples.normal[i, s, 0]
+    for slot in range(1, SLOTS):
+        if samples.shape[i, s, slot] == shape:
+            normal = samples.normal[i, s, slot]
+    return wp.normalize(wp.vec3d(normal))
+
+
+@wp.func
 def cell_loss(
     shape: CellShape,
     F: wp.mat33d,
@@ -141,9 +152,10 @@ def accumulate_cells(
     lead_bar = force_bar * (share * curvature + steep)
     depth_bar = step.normal_bar[i, e][2] - force_bar * steep * depth
 
-    start, ahead, closing = motion_of_cell(instances, basis, motion, shapes, samples, i, row, shape, n, dt)
+    face = normal_of(instances, samples, i, row, shape)
+    start, ahead, closing = motion_of_cell(instances, basis, motion, shapes, samples, i, row, shape, face, dt)
     gap = gap_of(instances, samples, i, row, shape)
-    other = curvature_of(shapes, shape, n)
+    other = curvature_of(shapes, shape, face)
     cell_shape = shape_of_cell(surface, instances, basis, i, row, other)
     back = step.contact_bar[i, e]
     along = wp.dot(n, back)
@@ -152,14 +164,14 @@ def accumulate_cells(
         moved = gradient_of(instances, basis, q, i, row) - start
         pulled = displacement_gradient(basis.row_gradient, costate, i, row, instances.function_count[i])
         centre_bar = wp.transpose(pulled) * constraints.force[i, e] - wp.transpose(moved) * back
-        centre_bar += along * (wp.transpose(ahead - start) * n)
+        centre_bar += along * (wp.transpose(ahead - start) * face)
         centre_bar += wp.transpose(start) * turned_back(shapes, shape, back, dt)
     by_shape, by_F, _by_n, _by_gap, by_place, by_ratio, _o, _l, _c = wp.grad(cell_loss)(
-        cell_shape, ahead, n, gap, closing, ratio, onset_bar, lead_bar, centre_bar
+        cell_shape, ahead, face, gap, closing, ratio, onset_bar, lead_bar, centre_bar
     )
-    fade_shape, fade_F, _fade_n = wp.grad(fade_of)(cell_shape, ahead, n)
-    cell = cell_at(cell_shape, ahead, n, gap, closing, ratio)
-    fade = fade_of(cell_shape, ahead, n)
+    fade_shape, fade_F, _fade_n = wp.grad(fade_of)(cell_shape, ahead, face)
+    cell = cell_at(cell_shape, ahead, face, gap, closing, ratio)
+    fade = fade_of(cell_shape, ahead, face)
     spared = zero  # or one, far away: either does not change
     if gap <= NEAR * cell_shape.steepest:
         touched = touched_share(surface, samples.shape, samples.gap, cell_shape, fade, i, row, shape)
@@ -185,8 +197,8 @@ def accumulate_cells(
     step.cell_spared[i, e] = spared_bar
     step.cell_fade[i, e] = wp.vec2d(fade * neighbour_at(cell_shape, fade, zero), fade)
     fade_bar = spared_bar * by_fade
-    step.cell_gradient[i, e] = by_F + fade_bar * fade_F + along * wp.outer(n, cell.centre)
-    step.cell_place[i, e] = by_place * n
+    step.cell_gradient[i, e] = by_F + fade_bar * fade_F + along * wp.outer(face, cell.centre)
+    step.cell_place[i, e] = by_place * face
 
     # lengths grow with the scale, but not the radius of what is touched
     above = half * spared_bar * by_gap
@@ -222,7 +234,7 @@ def restore_rows(
     if constraints.row[i, e] == row:
         return
     shape = constraints.shape[i, e]
-    n = constraints.normal[i, e]
+    n = normal_of(instances, samples, i, row, shape)
     _start, ahead, closing = motion_of_cell(instances, basis, motion, shapes, samples, i, row, shape, n, dt)
     cell_shape = shape_of_cell(surface, instances, basis, i, row, curvature_of(shapes, shape, n))
     ratio = constraints.stiffness[i, e] * constraints.dent_compliance[i, e]
