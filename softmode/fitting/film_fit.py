@@ -134,7 +134,7 @@ def fit_film(
     sets[..., 0], sets[..., 1] = np.log(SPECIFIC * material.density)[:, None, None], np.log(DAMPED)[:, None]
     sets[..., START] += clip.interval * np.array(LATE)
     sets = sets.reshape(len(SPECIFIC), -1, len(NAMES))
-    tried = kept("costs", lambda: cost_of(residuals(sets.reshape(-1, len(NAMES))))).reshape(len(SPECIFIC), -1)
+    tried = kept("tried", lambda: cost_of(residuals(sets.reshape(-1, len(NAMES))))).reshape(len(SPECIFIC), -1)
     sets, costs = sets[np.arange(len(sets)), tried.argmin(axis=1)], tried.min(axis=1)
     motion = ("youngs_modulus", "viscosity", "start", *_POSE, "edge")
     narrow = space.changed(space.prior, "viscosity", 0.5)
@@ -148,7 +148,7 @@ def fit_film(
     for n, k in enumerate(np.argsort(costs)[:2]):
         tell("fitting", 0.3 + 0.15 * n)
         tight = replace(space, prior=narrow, mean=space.changed(space.mean, "viscosity", sets[k, 1]))
-        found.append(kept(f"start {n}", functools.partial(refined, tight, sets[k], motion)))
+        found.append(kept(f"near start {n}", functools.partial(refined, tight, sets[k], motion)))
     residuals.frames = every
     tell("fitting", 0.6)
     x = min(found, key=lambda one: float(one[0]))[1:]

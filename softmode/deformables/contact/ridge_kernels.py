@@ -22,10 +22,11 @@ RIDGE = wp.constant(wp.float64(0.22))
 """Force per length of an edge of 90 degrees over E / (1 - nu^2) and depth, less what its faces press."""
 
 STEEP = wp.constant(wp.float64(0.3))
-"""Slope of the flatter of two faces over that of the steeper one, up to which their edge is the rim of a flat punch.
-Cosine of the nearest face to the cell up to which that is a flank beside it: a plane goes on where the cell ends."""
-FACING = wp.constant(wp.float64(0.55))
-"""Cosine from which on it counts as a whole."""
+"""Slope of the flatter of two faces over that of the steeper one, up to which their edge is the rim of a flat punch and
+presses nothing of its own."""
+FLANK, FRONT = wp.constant(wp.float64(0.3)), wp.constant(wp.float64(0.55))
+"""Cosines between the normals of the nearest face and of the cell: up to the first the face is a flank beside the cell,
+whose edge counts nothing, since the plane of the cell goes on where the cell ends; from the second on it counts."""
 
 
 @wp.func
@@ -88,4 +89,4 @@ def ridge_in_cell(half: wp.vec3d, x: wp.vec3d, inward: wp.vec3d, side: wp.float6
             over = facing[k] * wp.max(away[k], zero)
             moment -= part * (facing[i] * away[i] + facing[j] * away[j] + over)
     depth = moment / wp.max(length, wp.float64(1.0e-30))
-    return length * wp.clamp((facing[axis] - STEEP) / (FACING - STEEP), zero, one), depth
+    return length * wp.clamp((facing[axis] - FLANK) / (FRONT - FLANK), zero, one), depth
