@@ -70,8 +70,9 @@ class NeuralWeights:
     def of(cls, arrays: Mapping[str, np.ndarray]) -> NeuralWeights:
         """Return the network of `arrays`."""
         pairs = range((len(arrays) - 2) // 2)
-        layers = [(np.float64(arrays[f"matrix_{k}"]), np.float64(arrays[f"bias_{k}"])) for k in pairs]
-        return cls(layers=layers, bounds=np.float64(arrays["bounds"]), train_seconds=float(arrays["seconds"]))
+        found = {name: np.asarray(array, np.float64) for name, array in arrays.items()}
+        layers = [(found[f"matrix_{k}"], found[f"bias_{k}"]) for k in pairs]
+        return cls(layers=layers, bounds=found["bounds"], train_seconds=float(found["seconds"]))
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return what a file keeps."""
@@ -122,7 +123,7 @@ def train_neural_weights(
             [(points, volume)], options, youngs_modulus=youngs_modulus, poissons_ratio=poissons_ratio
         )
         with whole_file(path) as file:
-            np.savez(file, **network.arrays())
+            np.savez(file, allow_pickle=False, **network.arrays())
     with np.load(path) as file:
         return NeuralWeights.of(file)
 
@@ -182,7 +183,7 @@ def train_many(
             shape = len(objects), options.transform_count, options.mode_count, 4, 3
             transform = options.transform_deviation * torch.randn(*shape)
             mix = iteration / options.iterations
-            energy = torch.vmap(lambda *at, mix=mix: elastic_energy(torch, *at, mu, lam, mix))(
+            energy = torch.vmap(lambda w, s, x, z, mix=mix: elastic_energy(torch, w, s, x, z, mu, lam, mix))(
                 weight, slope, x * scale, transform
             )
             elastic = options.elastic_weight / count * (volumes * energy.sum(dim=(1, 2))).sum()

@@ -17,6 +17,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from benchmarks.accuracy import KAPPA
+from benchmarks.freeform.explicit_kernels import pull_particles
 from benchmarks.freeform.grips import DENSITY, DT, POISSONS_RATIO, Grip
 from softmode.deformables.materials.material import Material
 from softmode.deformables.materials.material_kernels import MaterialModel
@@ -33,25 +34,6 @@ COURANT = 0.4
 """Part of a cell that sound crosses in a step."""
 PARTS = 2
 """Particles along the edge of a cell."""
-
-
-@wp.kernel
-def _pull(
-    # Particles:
-    x: wp.array2d[wp.vec3],
-    v: wp.array2d[wp.vec3],
-    mass: wp.array2d[float],
-    # Springs:
-    index: wp.array[int],
-    stiffness: wp.array[float],
-    target: wp.array[wp.vec3],
-    dt: float,
-):
-    """Add the impulse of a spring to its particle, by implicit Euler in that spring alone."""
-    i = wp.tid()
-    k = index[i]
-    rate = dt * stiffness[i] / mass[0, k]
-    v[0, k] = (v[0, k] + rate * (target[i] - x[0, k])) / (1.0 + dt * rate)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +87,8 @@ class ExplicitParticles:
         body = ParticleBody(positions=points, masses=density * volumes, material=made)
         self.rest, self.dt, self.springs, self.time = points, dt, springs, 0.0
         grid = Grid.around(points, spacing=spacing, room=math.ceil(reach / spacing))
-        options = MpmOptions(grid=grid, dt=dt / self.substeps, gravity=tuple(map(float, gravity)))
+        pull: Any = tuple(map(float, gravity))
+        options = MpmOptions(grid=grid, dt=dt / self.substeps, gravity=pull)
         self.simulation = MpmSimulation(body, options, step_count=1, device="cpu")
         self.index = wp.array(springs.index, dtype=int, device="cpu")
         self.stiffness = wp.array(springs.stiffness, dtype=float, device="cpu")
@@ -118,7 +101,7 @@ class ExplicitParticles:
             target = wp.array(self.springs.targets(self.time), dtype=wp.vec3, device="cpu")
             state = simulation.first
             inputs = [state.x, state.v, simulation.mass, self.index, self.stiffness, target, small]
-            wp.launch(_pull, len(self.index), inputs=inputs, device="cpu")
+            wp.launch(pull_particles, len(self.index), inputs=inputs, device="cpu")
             simulation.forward()
             state.copy_from(simulation.last)
         simulation.check()

@@ -231,7 +231,7 @@ class References:
         if f"{key}_about" not in self.arrays:
             self.add(key, packed(*refine(thing, condition, steps)))
             with whole_file(self.path) as file:
-                np.savez_compressed(file, **self.arrays)
+                np.savez_compressed(file, allow_pickle=False, **self.arrays)
         shapes = self.arrays[f"{key}_shapes"].astype(np.float64)
         return (self.arrays[f"{key}_courses"] @ shapes).reshape(steps, -1, 3)
 

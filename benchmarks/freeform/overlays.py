@@ -45,7 +45,9 @@ def paint(panel: Any, points: Array, faces: Faces, colour: str, view: Array, alp
     front = front[np.argsort(corner[front, :, 2].mean(axis=1), kind="stable")]
     light = 0.45 + 0.55 * np.clip(normal[front] @ np.array([0.3, 0.5, 0.81]), 0.0, 1.0)
     colours = np.column_stack([light[:, None] * np.array(to_rgb(colour)), np.full(len(front), alpha)])
-    panel.add_collection(PolyCollection(corner[front, :, :2], facecolors=colours, edgecolors="none", antialiased=False))
+    panel.add_collection(
+        PolyCollection(list(corner[front, :, :2]), facecolors=colours, edgecolors="none", antialiased=False)
+    )
 
 
 def magnify(panel: Any, layers: list[tuple[Array, Faces, str, float]], view: Array, place: int) -> None:
@@ -111,6 +113,7 @@ def figure5(path: Path, *, quick: bool = False) -> dict[str, float]:
             q = Simulation(scene, body, spring_row).run(at)[0]
             found[label] = rest + body.evaluate(rest - body.offset)[0] @ (q[-1] - q[0]), colour
         particles = beam_particles(scene, 0.25)
+        moved = particles.rest
         for _ in range(at):
             moved = particles.step()
         near = ((rest[:, None] - particles.rest) ** 2).sum(axis=2).argsort(axis=1)[:, :8]
@@ -144,8 +147,10 @@ def figure6(folder: Path, path: Path, *, quick: bool = False) -> dict[str, float
     left = [condition for name, condition in SHOWN if name not in {thing.name for thing, _ in shown}]
     shown += list(zip(things.values(), left, strict=False))
     figure, panels = _panels(2, len(shown), (4.6 * len(shown), 7.4))
-    bases = {"FreeForm's functions, m = 16": (affine(16, rank_tolerance=FINE_RANK), GREEN)}
-    bases["default functions, 68"] = EQUAL["default, 68"], BLUE
+    bases: dict[str, tuple[Any, str]] = {
+        "FreeForm's functions, m = 16": (affine(16, rank_tolerance=FINE_RANK), GREEN),
+        "default functions, 68": (EQUAL["default, 68"], BLUE),
+    }
     names = {"farthest": "four far points pulled", "boundary": "both ends pulled", "fix": "held below"}
     record = {}
     for column, (thing, condition) in enumerate(shown):

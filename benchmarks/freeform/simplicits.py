@@ -58,7 +58,7 @@ def main() -> None:
         for key, v in n.arrays().items()
     }
     with whole_file(given.output) as file:
-        np.savez_compressed(file, **arrays)
+        np.savez_compressed(file, allow_pickle=False, **arrays)
     print(f"{len(things)} networks, {networks[0].train_seconds:.0f} s", flush=True)
 
 
