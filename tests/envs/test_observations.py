@@ -224,11 +224,11 @@ TASKS: dict[str, Callable[[HostState], Numbers]] = {
 }
 """What each task adds."""
 EPISODES = {
-    "PushSoft": ({"goal_yaw": 0.7},),
+    "PushSoft": ({"goal_yaw": 0.7, "yaw": -2.5},),
     "ShapeSoft": ({"goal": (0.05, 1.0)}, {"goal": (0.05, 1.0 - np.pi)}),
 }
-"""Options of the episodes: PushSoft draws no yaw of a goal by itself; in ShapeSoft a finger touches the post, the other
-one on its way back."""
+"""Options of the episodes: PushSoft draws no yaw of a goal by itself, and its finger is to dent points that are seen;
+in ShapeSoft a finger touches the post, the other one on its way back."""
 STILL = {"PressSoft": {"opening", "command_opening"}}
 """Segments that stay zero: the fingers of PressSoft are closed."""
 
