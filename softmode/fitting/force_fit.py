@@ -103,8 +103,7 @@ class Press:
             if bits & FAILED:
                 what = f"{1e3 * depth:.3g} mm deep: {', '.join(status_reasons(int(bits)))}"
                 raise SolverDiverged(what, hint="check the units of the depths, the place and the size of the object")
-        wrench = worlds.solver.body_wrench.numpy().reshape(len(depths), -1)[:, :3]
-        return -(wrench @ toward)
+        return -(worlds.solver.body_wrench.numpy().reshape(len(depths), -1)[:, :3] @ toward)
 
     def _contact(self, body: ReducedBody, place: ArrayLike) -> tuple[Array, Array]:
         """Return where the ball's centre is when it touches a place of the file, and its way, in the body frame."""
