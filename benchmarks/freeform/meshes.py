@@ -8,6 +8,7 @@ every method. What references give at some points of an object is stored by the 
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -24,7 +25,7 @@ from softmode.deformables.quadrature.quadrature_mesh import cap_holes, quadratur
 from softmode.errors import AssetError
 from softmode.files import whole_file
 from tests.oracle.cut_mesh import CutMesh
-from tests.oracle.fem import ConvergenceError, Minimiser, Solid
+from tests.oracle.fem import ConvergenceError, Mesh, Minimiser, Solid
 
 Array = NDArray[np.float64]
 
@@ -167,12 +168,31 @@ def simulate(thing: MeshThing, grip: Grip, points: Array, count: int, steps: int
     """Return displacements [m] of rest points (P, 3) by so many elements along the longest edge, (steps, P, 3)."""
     mesh = CutMesh(thing.vertices, thing.faces, count)
     solid = Solid(mesh, youngs_modulus=thing.youngs_modulus, poissons_ratio=POISSONS_RATIO, density=DENSITY)
-    at, membrane = mesh.interpolation(grip.points), mesh.membrane(thing.youngs_modulus)
-    pull, inertia = at.T @ sparse.diags(grip.stiffness), solid.mass / DT**2
-    minimise = Minimiser(solid, inertia + pull @ at + membrane, np.zeros(len(mesh.nodes), bool))
-    dead = solid.body_force(grip.gravity * thing.down) + membrane @ mesh.nodes
     matrix = mesh.interpolation(points)
-    x, v, frames = mesh.nodes, np.zeros_like(mesh.nodes), []
+    membrane = mesh.membrane(thing.youngs_modulus)
+    return np.array([matrix @ frame for frame in stepped(mesh, solid, grip, thing.down, steps, membrane)])
+
+
+def stepped(
+    mesh: Mesh, solid: Solid, grip: Grip, down: Array, steps: int, membrane: sparse.csr_matrix | None = None
+) -> Iterator[Array]:
+    """Step elements by implicit Euler; yield nodal displacements [m], (N, 3).
+
+    Args:
+        mesh: The elements.
+        solid: What they are made of.
+        grip: Springs that hold and pull.
+        down: Direction of gravity, (3,).
+        steps: Number of steps.
+        membrane: Stiffness of a skin [N/m], (N, N).
+    """
+    at = mesh.interpolation(grip.points)
+    pull, inertia = at.T @ sparse.diags(grip.stiffness), solid.mass / DT**2
+    stiffness, dead = inertia + pull @ at, solid.body_force(grip.gravity * down)
+    if membrane is not None:
+        stiffness, dead = stiffness + membrane, dead + membrane @ mesh.nodes
+    minimise = Minimiser(solid, stiffness, np.zeros(len(mesh.nodes), bool))
+    x, v = mesh.nodes, np.zeros_like(mesh.nodes)
     for n in range(1, steps + 1):
         ahead = x + DT * v
         load = inertia @ ahead + dead + pull @ grip.targets(n, steps)
@@ -181,8 +201,7 @@ def simulate(thing: MeshThing, grip: Grip, points: Array, count: int, steps: int
         except ConvergenceError:  # The inertial guess may turn elements inside out; the last positions do not.
             found, _ = minimise(x, load, 1e-4)
         x, v = found, (found - x) / DT
-        frames.append(matrix @ (x - mesh.nodes))
-    return np.array(frames)
+        yield x - mesh.nodes
 
 
 def refine(thing: MeshThing, condition: str, steps: int) -> tuple[Array, int, float]:

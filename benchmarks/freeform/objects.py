@@ -18,12 +18,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from benchmarks.accuracy import FINE_RANK, affine
 from benchmarks.freeform import simplicits
 from benchmarks.freeform.grips import CONDITIONS, DENSITY, DT, GRAVITY, POISSONS_RATIO, PULL, SPRINGS, STEPS, Grip
-from benchmarks.freeform.meshes import MeshThing, References, read_folder
+from benchmarks.freeform.meshes import MeshThing, References, read_folder, stepped
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.body.regions import Region
 from softmode.deformables.body.rkpm import sample_farthest
@@ -36,7 +35,7 @@ from softmode.deformables.reduction.cache import fingerprint_of
 from softmode.deformables.reduction.options import BuildOptions
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from softmode.files import whole_file
-from tests.oracle.fem import ConvergenceError, Mesh, Minimiser, Solid
+from tests.oracle.fem import ConvergenceError, Mesh, Solid
 from tests.oracle.solids import SOLIDS
 from tests.scenes import Scene
 from tests.shape_trials import Voxels, voxelise
@@ -210,22 +209,7 @@ def _simulate_fem(thing: Thing, grip: Grip, mesh: Mesh, steps: int) -> Array:
         poissons_ratio=POISSONS_RATIO,
         density=DENSITY,
     )
-    at = mesh.interpolation(grip.points)
-    pull = at.T @ sparse.diags(grip.stiffness)
-    inertia = solid.mass / DT**2
-    minimise = Minimiser(solid, inertia + pull @ at, np.zeros(len(mesh.nodes), bool))
-    weight = solid.body_force(grip.gravity * thing.down)
-    x, v, frames = mesh.nodes, np.zeros_like(mesh.nodes), []
-    for n in range(1, steps + 1):
-        ahead = x + DT * v
-        load = inertia @ ahead + weight + pull @ grip.targets(n, steps)
-        try:
-            found, _ = minimise(ahead, load, 1e-4)
-        except ConvergenceError:  # The inertial guess may turn elements inside out; the last positions do not.
-            found, _ = minimise(x, load, 1e-4)
-        x, v = found, (found - x) / DT
-        frames.append(x - mesh.nodes)
-    return np.array(frames)
+    return np.array(list(stepped(mesh, solid, grip, thing.down, steps)))
 
 
 def reduced_motion(

@@ -641,7 +641,8 @@ def gather_contacts(
         firm = relative * surface.slenderness[row]
         kappa = stiffness_per_area(instances, i, BULK_FACTOR, firm, partner_mass, partner_area, dt)
         stiffness = wp.float64(kappa * area)
-        compliance = wp.float64(spared * dent_compliance(instances, i, relative, surface.dent_length[row]) / area)
+        dent = dent_compliance(instances, i, relative, surface.dent_length[row])
+        compliance = wp.float64(spared * dent / area)
         share = float(1.0)
         if partner_mass > 0.0:  # what is light beside the body turns faster than its cells, which lag by a step
             share = partner_mass / (partner_mass + float(instances.mass[i]))
@@ -654,7 +655,6 @@ def gather_contacts(
         if shapes.kind[shape] == BOX:
             found = float(samples.gap[i, s, slot])
             length, deep, inward = ridge_of(instances, basis, motion, shapes, samples, i, row, shape, found)
-            dent = dent_compliance(instances, i, relative, surface.dent_length[row])
             if length > wp.float64(0.0) and dent > 0.0:
                 modulus = wp.float64(instances.scale[i] * surface.dent_length[row] / dent)
                 ridge = RIDGE * modulus * length / stiffness

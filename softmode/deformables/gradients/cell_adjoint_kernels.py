@@ -52,25 +52,27 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
+def slot_of(samples: Samples, i: int, s: int, shape: int):
+    """Return the slot of a sample, counted from the first of its body, in which a shape stands."""
+    found = int(0)
+    for slot in range(1, SLOTS):
+        if samples.shape[i, s, slot] == shape:
+            found = slot
+    return found
+
+
+@wp.func
 def gap_of(instances: Instances, samples: Samples, i: int, sample: int, shape: int):
     """Return the gap [m] of a sample with a shape at the start of the step, as its contact takes it."""
     s = sample - instances.row_start[i]
-    gap = samples.gap[i, s, 0]
-    for slot in range(1, SLOTS):
-        if samples.shape[i, s, slot] == shape:
-            gap = samples.gap[i, s, slot]
-    return wp.max(gap, -wp.float64(OVERLAP * instances.size[i]))
+    return wp.max(samples.gap[i, s, slot_of(samples, i, s, shape)], -wp.float64(OVERLAP * instances.size[i]))
 
 
 @wp.func
 def normal_of(instances: Instances, samples: Samples, i: int, sample: int, shape: int):
     """Return the normal of a shape at a sample, which its cell is found with; edges turn that of the contact."""
     s = sample - instances.row_start[i]
-    normal = samples.normal[i, s, 0]
-    for slot in range(1, SLOTS):
-        if samples.shape[i, s, slot] == shape:
-            normal = samples.normal[i, s, slot]
-    return wp.normalize(wp.vec3d(normal))
+    return wp.normalize(wp.vec3d(samples.normal[i, s, slot_of(samples, i, s, shape)]))
 
 
 @wp.func
