@@ -25,8 +25,6 @@ Metric = IntEnum("Metric", "object_height bin_distance others_inside", start=0)
 
 LONGEST = wp.constant(0.5)
 """Way of a toy from which its potential is 0 [m]."""
-GENTLE = wp.constant(5.0)
-"""Force of a finger that counts half [N]."""
 
 
 @wp.struct
@@ -49,6 +47,7 @@ class Plan:
     dropped: float  # height under which another toy than the first is lost [m]
     clearance: float  # over the rim while carrying [m]
     rest_speed: float  # [m/s]
+    light: float  # force of a finger that counts half in letting go [N]
     hold_steps: int
 
 
@@ -141,7 +140,7 @@ def add_toy(state: WorldState, plan: Plan, w: int, o: int, at_hand: bool, share:
         free = 1.0
         if at_hand:  # the less the fingers squeeze, the better
             force = 0.5 * (wp.length(state.finger_force[w, 0]) + wp.length(state.finger_force[w, 1]))
-            free = 1.0 / (1.0 + force / GENTLE)
+            free = 1.0 / (1.0 + force / plan.light)
     if inside:
         carry = 1.0
     result.terms[w, Term.reach] += share * reach

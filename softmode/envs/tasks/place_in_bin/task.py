@@ -33,6 +33,8 @@ from softmode.splats.raster.pinhole import PinholeCamera
 
 CLEARANCE = 0.015
 """Between the rim and the bottom of what is carried over it [m]."""
+LIGHT = 5.0
+"""Force of a finger that counts half in letting go [N]; in proportion for hands that may press with less."""
 PACKED = 0.6
 """Most of the bin's volume that the bounding boxes of several toys may take."""
 _BUILD = BuildOptions(mode_count=1, cubature_count=48)
@@ -165,10 +167,10 @@ class PlaceInBin(Task):
 
     Reward terms: ``reach`` (0..1, tool to toy), ``grasp`` (0 or 0.5, both fingers hold it), ``carry`` (0..3, how little
     of the way up, across and down is left while it is held), ``release`` (0..2, in or over the bin, how little the
-    fingers squeeze), ``rest`` (0 or 2, no finger touches anything, at rest, all other objects in the bin),
-    ``gentle`` (at most 0, see `TaskConfig.care`). What is in
-    or over the bin keeps ``reach`` and ``grasp``, held or not. Success: ``rest`` for ``hold_steps`` steps in a row.
-    Failure: ``spilled``, another object is outside the bin's walls.
+    fingers squeeze, of what `squeeze_lead` lets them), ``rest`` (0 or 2, no finger touches anything, at rest, all other
+    objects in the bin), ``gentle`` (at most 0, see `TaskConfig.care`). What is in or over the bin keeps ``reach`` and
+    ``grasp``, held or not. Success: ``rest`` for ``hold_steps`` steps in a row. Failure: ``spilled``, another object
+    is outside the bin's walls.
 
     Of several toys (`ObjectSet.per_world`) each earns its share of the terms, those in the bin and the first that is
     not; the figures are those of the latter. Success: all toys are in.
@@ -202,6 +204,7 @@ class PlaceInBin(Task):
         toys = [thing.body.surface.points for thing in held.choices]
         others = [thing.body.surface.points for thing in held.others]
         self.wall, self.floor, self.margin, self.clearance = given.wall, given.floor, 0.3 * min(self.half), CLEARANCE
+        self.light = LIGHT * min(self.config.scene.control.squeeze_lead, 1.0)
         radius = [[thing.radius] * held.slots for thing in held.choices]
         self.radius = held.follow(radius, every_slot=held.slots > 1)
         """From the centre of each unscaled toy to its farthest point [m], shape (world_count, slots)."""
