@@ -93,11 +93,12 @@ def page(rows: list[dict[str, str]]) -> str:
     return text
 
 
-def play_mpc(episodes: int, seed: int, worlds: int = 256) -> tuple[int, int]:
+def play_mpc(episodes: int, seed: int, worlds: int = 32) -> tuple[int, int]:
     """Return in how many episodes examples/mpc_push.py succeeded, and in how many safely; the arm rests once it has."""
     from examples.mpc_push import ENV, PLANS, actions_of, drive
 
-    env, model = gym.make(ENV), gym.make_vec(ENV, num_envs=worlds, autoreset_mode="Disabled")
+    env: Any = gym.make(ENV)
+    model: Any = gym.make_vec(ENV, num_envs=worlds, autoreset_mode="Disabled")
     won = safe = 0
     for episode in range(seed, seed + episodes):
         _, _, info = drive(env, model, episode, PLANS)

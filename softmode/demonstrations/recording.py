@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium.spaces import Box
 
 from softmode.checks import SEED_MAX, require_number
-from softmode.demonstrations.schema import Feature
+from softmode.demonstrations.schema import GOALS, Feature
 from softmode.demonstrations.writer import DatasetWriter
 from softmode.errors import ConfigError
 
@@ -20,6 +20,8 @@ ATTEMPTS = 10
 
 PUSH_STEPS, PUSH_SHARE = 5, 0.2
 """Control steps of a push, and about which share of all steps is pushed."""
+LEARNER_STEPS, LEARNER_RATE = (5, 25), 0.05
+"""Control steps for which a learner plays at once, and how likely it begins in a step of the policy."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,10 +43,11 @@ def environment_features(
 
     The proprioception is ``observation.state``, the rest of a state vector ``observation.environment_state``, pictures
     are ``observation.images.CAMERA``; further there are ``action`` and what it led to, ``next.reward``, ``next.done``
-    and ``next.success``.
+    and ``next.success``. Goals are ``observation.achieved_goal`` and ``observation.desired_goal``.
 
     Args:
-        env: An environment whose observations are a vector, a picture, or a dict of ``pixels`` and ``agent_pos``.
+        env: An environment whose observations are a vector, a picture, a dict of ``pixels`` and ``agent_pos``, or one
+            with goals.
         pictures: How pictures are stored.
         camera: Name of the camera.
 
@@ -61,9 +64,13 @@ def environment_features(
         if isinstance(part, Box) and part.dtype == np.uint8 and len(part.shape) == 3 and key in ("", "pixels"):
             kind = "video" if pictures == "video" else "image"
             features[f"observation.images.{camera}"] = Feature(dtype=kind, shape=part.shape)
-        elif isinstance(part, Box) and len(part.shape) == 1 and key in ("", "agent_pos"):
+        elif isinstance(part, Box) and key in GOALS:
+            features[f"observation.{key}"] = Feature(dtype="float32", shape=part.shape)
+        elif isinstance(part, Box) and len(part.shape) == 1 and key in ("", "agent_pos", "observation"):
             # The leading numbers are the robot's own; all, if the environment does not tell.
             names, count, total = _names(task), 1 << 30 if task is None else task.layout.agent_size, part.shape[0]
+            if key == "observation":  # of an environment with goals, which has its own order
+                names, count = None, total
             for name, columns in (
                 ("observation.state", slice(0, min(count, total))),
                 ("observation.environment_state", slice(count, total)),
@@ -106,9 +113,11 @@ def observation_columns(observation: Any, features: Mapping[str, Feature]) -> di
     """
     parts = observation if isinstance(observation, Mapping) else {"": observation}
     columns: dict[str, Any] = {}
-    for part in parts.values():
+    for key, part in parts.items():
         part = np.asarray(part)
-        if part.ndim == 3:
+        if key in GOALS:
+            columns[f"observation.{key}"] = part
+        elif part.ndim == 3:
             (name,) = (name for name in features if name.startswith("observation.images."))
             columns[name] = part
         else:
@@ -135,6 +144,7 @@ def record_episodes(
     task: str,
     seed: int = 0,
     noise: float = 0.0,
+    learner: Callable[[Any], Any] | None = None,
     only_successes: bool = False,
     states: bool = False,
     seeds: int | None = None,
@@ -145,7 +155,9 @@ def record_episodes(
     With ``noise`` the robot is pushed off its way now and then: for :data:`PUSH_STEPS` steps something random is added
     to the actions played, all but the gripper's, the last. The policy's own action is what is recorded, so that the
     demonstrations show how to come back (DART, Laskey et al. 2017, with pushes instead of white noise, which would keep
-    a policy that waits until it is within a millimetre waiting).
+    a policy that waits until it is within a millimetre waiting). A ``learner`` plays now and then for a while instead,
+    and the policy shows what it would do where the learner goes (DAgger, Ross et al. 2011): a while is short, since a
+    policy with a plan takes another one when it is not followed.
 
     Args:
         env: The environment; its seeds count up from ``seed``.
@@ -155,6 +167,7 @@ def record_episodes(
         task: What was to be done, as a sentence.
         seed: Seed of the first episode.
         noise: Standard deviation of a push, in the unit of the actions.
+        learner: Turns observations into actions, which are not pushed.
         only_successes: Record only episodes that end in success.
         states: Record the state in which each episode begins as well, of an environment of softmode's; see
             `Dataset.state`.
@@ -179,7 +192,7 @@ def record_episodes(
         writer.discard_episode()
         observation, _ = env.reset(seed=seed + attempts)
         state = base.get_state().to_bytes() if states else None
-        success = _play(env, policy, writer, observation, seed + attempts, noise)
+        success = _play(env, policy, writer, observation, seed + attempts, noise, learner)
         attempts += 1
         if success or not only_successes:
             writer.save_episode(task, state=state)
@@ -198,6 +211,7 @@ def _play(
     observation: Any,
     seed: int,
     noise: float,
+    learner: Callable[[Any], Any] | None,
 ) -> bool:
     """Play an episode, which has just begun with an observation, into the writer; return whether it succeeded."""
     act, random = policy(seed), np.random.default_rng((seed, 0xDA27))
@@ -205,11 +219,17 @@ def _play(
     while not done:
         action = np.asarray(act(observation), np.float32)
         played = action.copy()
-        if not left and random.random() < PUSH_SHARE / PUSH_STEPS:
-            push, left = random.normal(0.0, noise, len(action) - 1).astype(np.float32), PUSH_STEPS
-        if left:
-            played[:-1] += push
-            left -= 1
+        if learner is not None:
+            if not left and random.random() < LEARNER_RATE:
+                left = int(random.integers(*LEARNER_STEPS, endpoint=True))
+            played = np.asarray(learner(observation), np.float32) if left else action
+            left = max(left - 1, 0)
+        else:
+            if not left and random.random() < PUSH_SHARE / PUSH_STEPS:
+                push, left = random.normal(0.0, noise, len(action) - 1).astype(np.float32), PUSH_STEPS
+            if left:
+                played[:-1] += push
+                left -= 1
         frame = {**observation_columns(observation, writer.features), "action": action}
         observation, reward, terminated, truncated, info = env.step(played)
         done = terminated or truncated
