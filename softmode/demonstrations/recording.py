@@ -20,8 +20,6 @@ ATTEMPTS = 10
 
 PUSH_STEPS, PUSH_SHARE = 5, 0.2
 """Control steps of a push, and about which share of all steps is pushed."""
-LEARNER_STEPS, LEARNER_RATE = (5, 25), 0.05
-"""Control steps for which a learner plays at once, and how likely it begins in a step of the policy."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,7 +142,6 @@ def record_episodes(
     task: str,
     seed: int = 0,
     noise: float = 0.0,
-    learner: Callable[[Any], Any] | None = None,
     only_successes: bool = False,
     states: bool = False,
     seeds: int | None = None,
@@ -155,9 +152,7 @@ def record_episodes(
     With ``noise`` the robot is pushed off its way now and then: for :data:`PUSH_STEPS` steps something random is added
     to the actions played, all but the gripper's, the last. The policy's own action is what is recorded, so that the
     demonstrations show how to come back (DART, Laskey et al. 2017, with pushes instead of white noise, which would keep
-    a policy that waits until it is within a millimetre waiting). A ``learner`` plays now and then for a while instead,
-    and the policy shows what it would do where the learner goes (DAgger, Ross et al. 2011): a while is short, since a
-    policy with a plan takes another one when it is not followed.
+    a policy that waits until it is within a millimetre waiting).
 
     Args:
         env: The environment; its seeds count up from ``seed``.
@@ -167,7 +162,6 @@ def record_episodes(
         task: What was to be done, as a sentence.
         seed: Seed of the first episode.
         noise: Standard deviation of a push, in the unit of the actions.
-        learner: Turns observations into actions, which are not pushed.
         only_successes: Record only episodes that end in success.
         states: Record the state in which each episode begins as well, of an environment of softmode's; see
             `Dataset.state`.
@@ -192,7 +186,7 @@ def record_episodes(
         writer.discard_episode()
         observation, _ = env.reset(seed=seed + attempts)
         state = base.get_state().to_bytes() if states else None
-        success = _play(env, policy, writer, observation, seed + attempts, noise, learner)
+        success = _play(env, policy, writer, observation, seed + attempts, noise)
         attempts += 1
         if success or not only_successes:
             writer.save_episode(task, state=state)
@@ -211,7 +205,6 @@ def _play(
     observation: Any,
     seed: int,
     noise: float,
-    learner: Callable[[Any], Any] | None,
 ) -> bool:
     """Play an episode, which has just begun with an observation, into the writer; return whether it succeeded."""
     act, random = policy(seed), np.random.default_rng((seed, 0xDA27))
@@ -219,17 +212,11 @@ def _play(
     while not done:
         action = np.asarray(act(observation), np.float32)
         played = action.copy()
-        if learner is not None:
-            if not left and random.random() < LEARNER_RATE:
-                left = int(random.integers(*LEARNER_STEPS, endpoint=True))
-            played = np.asarray(learner(observation), np.float32) if left else action
-            left = max(left - 1, 0)
-        else:
-            if not left and random.random() < PUSH_SHARE / PUSH_STEPS:
-                push, left = random.normal(0.0, noise, len(action) - 1).astype(np.float32), PUSH_STEPS
-            if left:
-                played[:-1] += push
-                left -= 1
+        if not left and random.random() < PUSH_SHARE / PUSH_STEPS:
+            push, left = random.normal(0.0, noise, len(action) - 1).astype(np.float32), PUSH_STEPS
+        if left:
+            played[:-1] += push
+            left -= 1
         frame = {**observation_columns(observation, writer.features), "action": action}
         observation, reward, terminated, truncated, info = env.step(played)
         done = terminated or truncated

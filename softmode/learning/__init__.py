@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from softmode.learning.checkpoints import Checkpoint as Checkpoint
     from softmode.learning.checkpoints import read_checkpoint as read_checkpoint
     from softmode.learning.checkpoints import write_checkpoint as write_checkpoint
-    from softmode.learning.cloning import clone as clone
     from softmode.learning.environments import make_vector_env as make_vector_env
     from softmode.learning.field_training import train_field as train_field
     from softmode.learning.hyperparameters import Hyperparameters as Hyperparameters
