@@ -89,8 +89,8 @@ def successes(env: gym.Env, policy: Callable[[int], Callable[[Any], Any]], episo
 
 
 def test_final(data: Dataset, script: int, clone: int, short: bool) -> None:
-    """The script succeeds, while recorded too, and the network, given enough to learn from, half as often."""
-    assert script > 0 and data.columns["next.success"][data.episode_stop - 1].mean() >= 0.5
+    """The script succeeds, in part where a push hits its last steps; the network, given enough, half as often."""
+    assert script > 0 and data.columns["next.success"][data.episode_stop - 1].mean() >= 0.25
     assert short or clone > 0.5 * script
 
 
