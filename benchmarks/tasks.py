@@ -59,7 +59,7 @@ def cell(task: str, method: str) -> tuple[str, str]:
         return f"python examples/behaviour_cloning.py --env {env}", ""
     if task != "PushSoft":
         return "", "no example yet"
-    return "python -m benchmarks.tasks MPC PushSoft --episodes 50", ""
+    return "python -m benchmarks.tasks MPC PushSoft --episodes 20", ""
 
 
 def known() -> list[dict[str, str]]:
