@@ -18,12 +18,12 @@ NU = 0.3
 DOWN = (0.0, 0.0, -GRAVITY)
 
 
-def uniaxial(strain: float, modulus: float) -> float:
+def uniaxial(strain: float, modulus: float, ratio: float = NU) -> float:
     """Return the stress of the default material under a uniaxial strain, free across [Pa].
 
     P = m (1 - 1 / (I + 1)) F + l (J - a) cof F, m = 4/3 mu, l = lambda + 5/6 mu, a = 1 + 3 m / (4 l).
     """
-    mu, lam = modulus / (2.0 + 2.0 * NU), modulus * NU / ((1.0 + NU) * (1.0 - 2.0 * NU))
+    mu, lam = modulus / (2.0 + 2.0 * ratio), modulus * ratio / ((1.0 + ratio) * (1.0 - 2.0 * ratio))
     m, k = 4.0 / 3.0 * mu, lam + 5.0 / 6.0 * mu
 
     def stress(along: float, across: float) -> tuple[float, float]:
