@@ -251,6 +251,9 @@ def roll(
         add_reduced_body(world, solid, material=material, **place, **(moving if level else {}))
         if kind != "plane":
             ground(world, kind)
+        for side in (-1.0, 1.0) if body == "torus" else ():  # which keep a wheel from falling over, without friction
+            pose = wp.transform(wp.vec3(0.0, side * 0.0253, 0.1), wp.quat_identity())
+            world.add_shape_box(-1, xform=pose, hx=4.0, hy=0.01, hz=0.09, cfg=newton.ModelBuilder.ShapeConfig(mu=0.0))
 
     down = GRAVITY * (np.sin(angle) * along - np.cos(angle) * np.array([0.0, 0.0, 1.0]))
     scene = Scene(populate, [solid], gravity=down.tolist(), ground=0.8 if kind == "plane" else None, dt=DT)
