@@ -29,7 +29,7 @@ from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body
 from softmode.deformables.model.status import status_reasons
-from softmode.deformables.quadrature.quadrature import quadrature_from_box
+from softmode.deformables.quadrature.quadrature import quadrature_from_box, quadrature_from_sphere
 from softmode.deformables.quadrature.quadrature_implicit import quadrature_from_implicit
 from softmode.deformables.reduction.build_body import build_body
 from softmode.deformables.reduction.cache import cached_body
@@ -87,6 +87,8 @@ def built(name: str, ratio: float = 0.3) -> ReducedBody:
     def build() -> ReducedBody:
         if name in BOXES:
             quadrature = quadrature_from_box(BOXES[name])
+        elif name == "ball of 1500":
+            quadrature = quadrature_from_sphere(RADIUS, surface_count=1500)
         elif name == "cylinder":
             quadrature = primitive_quadrature("cylinder", (2.0 * RADIUS, 2.0 * RADIUS, 0.1), 800)
         else:  # a torus about Z, its outer radius that of the others
@@ -238,12 +240,12 @@ def roll(
 ) -> Figure:
     """Roll a body down a slope, or along the level: speed gained, or kept, over that of a rigid one."""
     angle, turn = np.radians(degrees), rotation((0, 0, 1), np.radians(azimuth))
-    upright = np.eye(3) if body == "ball" else rotation((1, 0, 0), 0.5 * np.pi)
+    upright = rotation((1, 0, 0), 0.5 * np.pi) if body in ("cylinder", "torus") else np.eye(3)
     solid = default_ball() if body == "ball" else built(body)
-    share = {"ball": 0.4, "cylinder": 0.5, "torus": (0.035**2 + 0.75 * 0.015**2) / RADIUS**2}[body]
+    share = {"cylinder": 0.5, "torus": (0.035**2 + 0.75 * 0.015**2) / RADIUS**2}.get(body, 0.4)
     level = degrees == 0.0
     material = Material(youngs_modulus=modulus, poissons_ratio=0.3, density=300.0, viscosity=viscosity)
-    along = turn @ [1.0, 0.0, 0.0] if body == "ball" else np.array([1.0, 0.0, 0.0])
+    along = turn @ [1.0, 0.0, 0.0]
     moving: dict[str, Any] = {"velocity": 0.2 * along, "angular_velocity": np.cross([0, 0, 1], along) * 0.2 / RADIUS}
 
     def populate(world: newton.ModelBuilder) -> None:
@@ -378,10 +380,10 @@ def cases() -> Iterator[Case]:
     slopes = {5.0: 0.02, 1.0: 0.03, 0.5: 0.05, 0.25: 0.1}
     for modulus, (degrees, error) in itertools.product((1.0e5, 1.0e6), slopes.items()):
         goal = (0.88, 1.1) if degrees == 0.25 else (1.0 - error, 1.0 + error)
-        for kind, azimuth in itertools.product(("plane", "box", "mesh"), (0.0, 22.5, 45.0)):
+        for kind, azimuth in (("plane", 0.0), ("plane", 22.5), ("plane", 45.0), ("box", 0.0), ("mesh", 0.0)):
             name = f"{degrees} degrees, E {modulus:g}, {kind}, azimuth {azimuth}"
             yield Case(f"ball down {degrees} degrees", name, *goal, roll, ("ball", modulus, degrees, azimuth, kind))
-        for body in ("cylinder", "torus"):
+        for body in ("cylinder", "torus", "ball of 1500"):
             name = f"{body}, {degrees} degrees, E {modulus:g}"
             yield Case(f"{body} down {degrees} degrees", name, *goal, roll, (body, modulus, degrees))
     for modulus, (viscosity, low) in itertools.product((1.0e5, 1.0e6), ((0.0, 0.99), (0.002, 0.97))):
