@@ -181,14 +181,14 @@ def rod(radius: float, strain: float, material: Material) -> float:
 def ball(modulus: float, ratio: float, share: float) -> Figure:
     """Squeeze a ball between plates."""
     press = Press(default_ball(ratio), RADIUS, youngs_modulus=modulus, poissons_ratio=ratio)
-    force = press.force(share * RADIUS, 80)
+    force = press.force(share * RADIUS)
     return force / hertz(share * RADIUS, modulus, ratio), int(press.scene.reduced.status.numpy()[0])
 
 
 def two_balls(modulus: float, share: float) -> Figure:
     """Squeeze two balls in a row: by symmetry a plane is between them."""
     press = Press(default_ball(), RADIUS, count=2, youngs_modulus=modulus, damping=1.0e4)
-    return press.force(share * RADIUS, 80) / hertz(share * RADIUS, modulus), int(press.scene.reduced.status.numpy()[0])
+    return press.force(share * RADIUS) / hertz(share * RADIUS, modulus), int(press.scene.reduced.status.numpy()[0])
 
 
 def grip(name: str) -> Figure:

@@ -77,13 +77,8 @@ def test_pinched_sheet_keeps_what_touches() -> None:
     that touches is kept, without a flag, and the fingers press as far from the table with what lies on it taken off.
     """
     body, half, squeeze = sheet(), 0.001, 0.1
-    boxes = {
-        "table": (-0.05, -0.011, 0.05),
-        "lower": (0.01, -0.01 - (1.0 - squeeze) * half, 0.01),
-        "upper": (0.0, 0.0, 0.02),
-    }
-    boxes["table"] = (-0.05, -0.01 - half, 0.05)
-    boxes["upper"] = (0.0, 0.01 + (1.0 - squeeze) * half, 0.02)
+    above = 0.01 + (1.0 - squeeze) * half
+    boxes = {"table": (-0.05, -0.01 - half, 0.05), "lower": (0.01, -above, 0.01), "upper": (0.0, above, 0.02)}
     forces = []
     for lowered in (0.0, 0.01):
 
