@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
+from softmode.checks import require_number
 from softmode.deformables.quadrature.interior import Interior, interior_from_quadrature, interior_from_surface
 from softmode.deformables.quadrature.occupancy import KEPT_EXTENT, KEPT_SHARE
 from softmode.deformables.quadrature.quadrature_density import FOGGY
@@ -214,13 +215,16 @@ def _check_samples(body: ReducedBody, notes: _Notes, finger: float | None) -> No
     """Say how wide a finger has to be for the surface samples to carry it, and how many a narrower one needs."""
     area = body.surface.areas.sum()
     width = notes.measure("narrowest finger that its samples carry", np.sqrt(PATCH * area / body.surface_count), "m")
-    if finger is not None and finger < width:
+    if finger is None:
+        return
+    require_number("finger", finger, above=0.0, unit="m")
+    if finger < width:
         under = f"{PATCH * (finger / width) ** 2:.1f} of its {body.surface_count} surface samples"
         notes.find(
             "warning",
             "samples",
             f"{under} lie under a finger of {1e3 * finger:.3g} mm, which sinks in between fewer than {PATCH}",
-            f"build it with --surface {math.ceil(PATCH * area / finger**2)}",
+            f"build it with --surface {math.ceil(PATCH * area / finger**2 - 1.0e-6)}",
         )
 
 
