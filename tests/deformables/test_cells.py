@@ -74,33 +74,33 @@ def test_pinched_sheet_keeps_what_touches() -> None:
     """A sheet of 2 mm between a finger above and, below, another and the rim of a table: three shapes for two slots.
 
     A sample keeps the two nearest. The third is on the other side of the sheet, which has samples of its own: all that
-    touches is kept, without a flag, and the upper finger presses as the uniaxial law to 10 %.
+    touches is kept, without a flag, and the upper finger presses as it does where one shape is below.
     """
-    body, half, strain = sheet(), 0.001, 0.1
-    above = 0.01 + (1.0 - strain) * half
-    boxes = {"table": (-0.05, -above, 0.05), "lower": (0.01, -above, 0.01), "upper": (0.0, above, 0.02)}
+    above = 0.01 + 0.9e-3
+    upper, pressed = (0.0, above, 0.02), []
+    for below in (((-0.05, -above, 0.05), (0.01, -above, 0.01)), ((-0.04, -above, 0.06),)):
 
-    def populate(world: newton.ModelBuilder) -> None:
-        material = Material(youngs_modulus=1.0e5, poissons_ratio=NU, density=300.0, friction=0.0, mass_damping=100.0)
-        add_reduced_body(world, body, material=material, scale=0.5)
-        for x, z, wide in boxes.values():
-            pose = wp.transform(wp.vec3(x, 0.0, z), wp.quat_identity())
-            world.add_shape_box(-1, xform=pose, hx=wide, hy=0.01, hz=0.01)
+        def populate(world: newton.ModelBuilder, below: tuple[tuple[float, float, float], ...] = below) -> None:
+            material = Material(youngs_modulus=1.0e5, density=300.0, friction=0.0, mass_damping=100.0)
+            add_reduced_body(world, sheet(), material=material, scale=0.5)
+            for x, z, wide in (upper, *below):
+                pose = wp.transform(wp.vec3(x, 0.0, z), wp.quat_identity())
+                world.add_shape_box(-1, xform=pose, hx=wide, hy=0.01, hz=0.01)
 
-    scene = Scene(populate, [body], dt=0.004, options=SolverReducedOptions(contact_margin=0.03))
-    scene.step(100)
-    view, near = scene.reduced.view, 0
-    assert scene.reduced.status.numpy()[0] == 0
-    x, shape = view.samples.position.numpy()[0], view.samples.shape.numpy()[0]
-    for k, (middle, z, wide) in enumerate(boxes.values()):
-        gap = reference.distance_box(x - [middle, 0.0, z], np.array([wide, 0.01, 0.01]))
-        assert (shape[gap < 0.0] == k).any(axis=1).all()
-        near = near + (gap < 0.8 * float(view.instances.margin.numpy()[0]))
-    assert np.max(near) == 3
-    count = int(view.constraints.count.numpy()[0])
-    upper = view.constraints.shape.numpy()[0, :count] == 2
-    pressed = -view.constraints.force.numpy()[0, :count][upper, 2].sum()
-    assert pressed == pytest.approx(2.0 * 0.02 * 0.02 * uniaxial(strain, 1.0e5), rel=0.1)
+        scene = Scene(populate, [sheet()], dt=0.004, options=SolverReducedOptions(contact_margin=0.03))
+        scene.step(100)
+        view, near = scene.reduced.view, 0
+        assert scene.reduced.status.numpy()[0] == 0
+        x, shape = view.samples.position.numpy()[0], view.samples.shape.numpy()[0]
+        for k, (middle, z, wide) in enumerate((upper, *below)):
+            gap = reference.distance_box(x - [middle, 0.0, z], np.array([wide, 0.01, 0.01]))
+            assert (shape[gap < 0.0] == k).any(axis=1).all()
+            near = near + (gap < 0.8 * float(view.instances.margin.numpy()[0]))
+        assert np.max(near) == 1 + len(below)
+        count = int(view.constraints.count.numpy()[0])
+        upon = view.constraints.shape.numpy()[0, :count] == 0
+        pressed.append(-view.constraints.force.numpy()[0, :count][upon, 2].sum())
+    assert pressed[0] == pytest.approx(pressed[1], rel=0.02) and pressed[0] > 5.0
 
 
 @pytest.mark.parametrize("count", [2, pytest.param(3, marks=pytest.mark.rest)])
