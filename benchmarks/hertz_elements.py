@@ -1,8 +1,8 @@
-"""References for contact by finite elements: a sphere between rigid plates, and a long rod.
+"""References for contact by finite elements: a sphere between rigid plates.
 
 Run: ``python -m benchmarks.hertz_elements``. Own elements (axisymmetric quadrilaterals), the energy of softmode's
 default material written from its closed form, frictionless contact by a penalty a thousand times as stiff. Prints force
-over Hertz's on two meshes; of the rod, in plane strain, per length over E R. Edges and corners: `edge_elements`.
+over Hertz's on two meshes. Edges and corners: `edge_elements`.
 """
 
 from __future__ import annotations
@@ -32,12 +32,6 @@ def main() -> None:
             forces = press(*sphere(*counts), depths, ratio)
             row = [f / (4.0 / 3.0 / (1.0 - ratio**2) * d**1.5) for f, d in zip(forces, depths, strict=True)]
             print(f"nu {ratio}, {counts[0] * counts[1]} elements:", *(f"{value:.3f}" for value in row), flush=True)
-    depths = (0.01, 0.04, 0.1)
-    print("rod between plates, at d / R of", *depths)
-    for ratio in (0.3, 0.4):
-        for counts in ((60, 40), (110, 70)):
-            forces = press(*sphere(*counts, plane=True), depths, ratio)
-            print(f"nu {ratio}, {counts[0] * counts[1]} elements:", *(f"{force:.5f}" for force in forces), flush=True)
 
 
 def graded(count: int, share: float) -> Array:
@@ -46,26 +40,21 @@ def graded(count: int, share: float) -> Array:
     return share * x**2 + (1.0 - share) * x
 
 
-def sphere(around: int, out: int, *, plane: bool = False) -> tuple[Array, Array, Array, Ints, Mask, Array]:
-    """Return matrices and weights of F, dofs, what is held, the surface and its areas, of half a sphere about Z.
-
-    Or of a slice of a rod that does not stretch.
-    """
+def sphere(around: int, out: int) -> tuple[Array, Array, Array, Ints, Mask, Array]:
+    """Return matrices and weights of F, dofs, what is held, the surface and its areas, of half a sphere about Z."""
     angle, radius = np.meshgrid(0.5 * np.pi * graded(around, 0.85), 1.0 - graded(out, 0.85)[::-1], indexing="ij")
     x = np.stack([radius * np.sin(angle), radius * np.cos(angle)], -1).reshape(-1, 2)
     index = np.arange(len(x)).reshape(angle.shape)
     index[:, 0] = 0
     corners = np.stack([index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]], -1).reshape(-1, 4)
     gradient, weight, values = integrate(x, corners)
-    width = np.full(len(x), 1.0 / np.pi) if plane else x[:, 0]  # both sides of a slice are 2 wide, a ring 2 pi r long
-    r = np.einsum("qn,en->qe", values, width[corners]).ravel()
+    r = np.einsum("qn,en->qe", values, x[corners][:, :, 0]).ravel()
     matrix = np.zeros((len(weight), 9, 8))
     matrix[:, 0, 0::2], matrix[:, 2, 0::2] = gradient[:, :, 0], gradient[:, :, 1]
     matrix[:, 6, 1::2], matrix[:, 8, 1::2] = gradient[:, :, 0], gradient[:, :, 1]
-    if not plane:
-        matrix[:, 4, 0::2] = np.repeat(values, len(corners), axis=0) / r[:, None]
+    matrix[:, 4, 0::2] = np.repeat(values, len(corners), axis=0) / r[:, None]
     top = index[:, -1]
-    part = np.linalg.norm(np.diff(x[top], axis=0), axis=1) * np.pi * (width[top[1:]] + width[top[:-1]])
+    part = np.linalg.norm(np.diff(x[top], axis=0), axis=1) * np.pi * (x[top[1:], 0] + x[top[:-1], 0])
     area = np.convolve(part, [0.5, 0.5])
     held = np.stack([x[:, 0] < 1.0e-9, x[:, 1] < 1.0e-9], -1)
     held[index[1:, 0]] = True
