@@ -34,7 +34,6 @@ from softmode.deformables.quadrature.quadrature_implicit import quadrature_from_
 from softmode.deformables.reduction.build_body import build_body
 from softmode.deformables.reduction.cache import cached_body
 from softmode.deformables.reduction.options import BuildOptions
-from softmode.envs.tasks.lift_soft.task import lift_scene
 from softmode.envs.tasks.place_in_bin.task import BALL, DISC, TOY, bin_scene
 from softmode.envs.tasks.press_soft.task import press_scene
 from softmode.envs.tasks.push_soft.task import push_scene
@@ -61,7 +60,7 @@ BOXES = {
 }
 TASKS = (
     *("PushSoft puck", "PressSoft pad", "ShapeSoft post", "RopeRoute rope", "PlaceInBin die", "PlaceInBin ball"),
-    *("PlaceInBin disc", "LiftSoft beam", "LiftSoft plush"),
+    *("PlaceInBin disc", "LiftSoft beam"),
 )
 Figure = tuple[float, int]
 """What was measured over its reference, and status bits."""
@@ -112,7 +111,6 @@ def of_task(name: str) -> tuple[ReducedBody, Material]:
         "PressSoft pad": press_scene(),
         "ShapeSoft post": shape_scene(),
         "RopeRoute rope": rope_scene(),
-        "LiftSoft plush": lift_scene(),
     }
     toys = {"PlaceInBin die": TOY, "PlaceInBin ball": BALL, "PlaceInBin disc": DISC}
     scene = scenes.get(name) or bin_scene()
@@ -192,7 +190,7 @@ def two_balls(modulus: float, share: float) -> Figure:
 
 
 def grip(name: str) -> Figure:
-    """Hold a body between two opening plates: their normal force as it begins to fall, over m g / (2 mu)."""
+    """Hold a body between two opening plates: their normal force as it has slipped by 1 mm, over m g / (2 mu)."""
     body, material = of_task(name)
     mu, edges = 0.5, np.ptp(body.bounds, axis=0)
     width, config = float(edges[1]), newton.ModelBuilder.ShapeConfig(mu=0.5)
@@ -204,7 +202,7 @@ def grip(name: str) -> Figure:
             world.add_shape_box(world.add_body(is_kinematic=True), hx=0.01, hy=0.02, hz=0.01, cfg=config)
 
     scene = Scene(populate, [body], gravity=(0.0, 0.0, -GRAVITY), dt=DT)
-    held = 0.0
+    held, start = 0.0, 0.0
     needed = scene.mass() * GRAVITY / (2.0 * mu)
     for k in range(2400):
         rate = 0.0 if k < 240 else 0.1 * width / 2160.0  # opens from a squeeze of a tenth to none
@@ -213,7 +211,8 @@ def grip(name: str) -> Figure:
         for state in (scene.state, scene.next_state):
             state.body_q.assign(poses)
         scene.step()
-        if k > 240 and scene.qd()[:, 2] @ body.mean_basis < -0.01:
+        start = scene.centre()[2] if k == 240 else start
+        if k > 240 and scene.centre()[2] < start - 1.0e-3:
             break
         constraints = scene.reduced.view.constraints
         count = int(constraints.count.numpy()[0])
@@ -366,8 +365,8 @@ def bounce(kind: str, modulus: float, dt: float) -> Figure:
 
 def cases() -> Iterator[Case]:
     """Yield every case, the long ones first."""
-    unequal = (2.0e4, 1.0e6, 2.0e4, 2.0e5, 2.0e4)
-    for moduli in ((2.0e4,) * 5, (1.0e6,) * 5, unequal, (2.0e4,) * 3, (1.0e6,) * 3, unequal[:3]):
+    unequal = (1.0e5, 1.0e6, 1.0e5, 2.0e5, 1.0e5)  # five of 20 kPa would buckle: Greenhill's .354 m
+    for moduli in ((1.0e5,) * 5, (1.0e6,) * 5, unequal, (2.0e4,) * 3, (1.0e6,) * 3, unequal[:3]):
         name = f"{len(moduli)} of " + ("unequal E" if len(set(moduli)) > 1 else f"{moduli[0]:g} Pa")
         yield Case("stacks", name, 0.99, 1.01, stack, (moduli,))
     for share in (0.5, 0.9, 0.98):
@@ -400,7 +399,7 @@ def cases() -> Iterator[Case]:
     for name, ratio, strain in itertools.product(BOXES, (0.3, 0.45, 0.49), (0.01, 0.04, 0.1)):
         low = 0.93 if name.startswith("sheet") else 0.95
         yield Case(f"whole face, {name}", f"{name}, nu {ratio}, {strain:.0%}", low, 1.05, face, (name, ratio, strain))
-    for name, strain in itertools.product(TASKS[:-1], (0.01, 0.04, 0.1)):
+    for name, strain in itertools.product(TASKS, (0.01, 0.04, 0.1)):
         yield Case(f"whole face, {name}", f"{name}, {strain:.0%}", 0.9, 1.1, task_face, (name, strain))
     for modulus, ratio, share in itertools.product((1.0e5, 1.0e6), (0.3, 0.45, 0.49), (0.01, 0.02, 0.04, 0.08)):
         name = f"{share:.0%} of R, E {modulus:g}, nu {ratio}"
