@@ -190,7 +190,7 @@ def two_balls(modulus: float, share: float) -> Figure:
 
 
 def grip(name: str) -> Figure:
-    """Hold a body between two opening plates: their normal force as it has slipped by 1 mm, over m g / (2 mu)."""
+    """Hold a body between two opening plates: their normal force before it falls, over m g / (2 mu)."""
     body, material = of_task(name)
     mu, edges = 0.5, np.ptp(body.bounds, axis=0)
     width, config = float(edges[1]), newton.ModelBuilder.ShapeConfig(mu=0.5)
@@ -212,11 +212,12 @@ def grip(name: str) -> Figure:
             state.body_q.assign(poses)
         scene.step()
         start = scene.centre()[2] if k == 240 else start
-        if k > 240 and scene.centre()[2] < start - 1.0e-3:
+        if k > 240 and scene.centre()[2] < start - 0.01:
             break
-        constraints = scene.reduced.view.constraints
-        count = int(constraints.count.numpy()[0])
-        held = 0.5 * np.abs(constraints.force.numpy()[0, :count, 1]).sum() / needed
+        if scene.qd()[:, 2] @ body.mean_basis > -0.005:
+            constraints = scene.reduced.view.constraints
+            count = int(constraints.count.numpy()[0])
+            held = 0.5 * np.abs(constraints.force.numpy()[0, :count, 1]).sum() / needed
     return float(held), int(scene.reduced.status.numpy()[0])
 
 
@@ -375,7 +376,8 @@ def cases() -> Iterator[Case]:
         for name in ("youngs_modulus", "poissons_ratio", "density", "friction", "qd"):
             yield Case("gradients", f"{kind}, {name}", 0.995, 1.005, gradient, (kind, name))
     for name in TASKS:
-        yield Case("grips of tasks", name, 0.95, 1.05, grip, (name,))
+        if name != "RopeRoute rope":  # which hangs down on both sides
+            yield Case("grips of tasks", name, 0.95, 1.05, grip, (name,))
     slopes = {5.0: 0.02, 1.0: 0.03, 0.5: 0.05, 0.25: 0.1}
     for modulus, (degrees, error) in itertools.product((1.0e5, 1.0e6), slopes.items()):
         goal = (0.88, 1.1) if degrees == 0.25 else (1.0 - error, 1.0 + error)
@@ -400,7 +402,7 @@ def cases() -> Iterator[Case]:
         low = 0.93 if name.startswith("sheet") else 0.95
         yield Case(f"whole face, {name}", f"{name}, nu {ratio}, {strain:.0%}", low, 1.05, face, (name, ratio, strain))
     for name, strain in itertools.product(TASKS, (0.01, 0.04, 0.1)):
-        yield Case(f"whole face, {name}", f"{name}, {strain:.0%}", 0.9, 1.1, task_face, (name, strain))
+        yield Case(f"between plates, {name}", f"{name}, {strain:.0%}", 0.9, 1.1, task_face, (name, strain))
     for modulus, ratio, share in itertools.product((1.0e5, 1.0e6), (0.3, 0.45, 0.49), (0.01, 0.02, 0.04, 0.08)):
         name = f"{share:.0%} of R, E {modulus:g}, nu {ratio}"
         yield Case(f"Hertz, {share:.0%} of R", name, 0.93, 1.07, ball, (modulus, ratio, share))
