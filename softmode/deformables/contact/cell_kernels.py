@@ -10,7 +10,7 @@ n of what is touched, the rest normal N and F of the body a step's velocity ahea
                                                 of the penalty, a: ``steepest``
     b = A (H + H_other) / (2 pi)                range by the mean curvatures of both: exact for a sphere
     e = sqrt(e_0^2 + t^2 + b^2)                 e_0: ``contact_smoothing``
-    q = e/2 - gap - b/2 - 0.15 e_0              penetration, a step's velocity ahead
+    q = e/2 - gap - b/2 - 0.15 e_0 (e_0/e)^2    penetration, a step's velocity ahead
     T = -min(L/2 - q L/(3 t), L t/(6 q)) m/|m|  centre of pressure from the sample, at rest, in the onset;
                                                 -L t/(12 (q - e/2)) m/|m| beyond
 
@@ -34,8 +34,9 @@ long against a dent, or a face that rides in its onset is soft and stiff in turn
 FACING = wp.constant(wp.float64(0.2))
 """Cosine below which a cell belongs to a face around an edge, whose tilt says nothing of the gaps."""
 LATE = wp.constant(wp.float64(0.15))
-"""Share of e_0 by which a contact begins later than half its range outside: a face that rides in its onset then stands,
-from 1 to 10 % of strain, within 1 % of where it should."""
+"""Share of e_0 by which a level contact begins later than half its range outside: a face that rides in its onset then
+stands, from 1 to 10 % of strain, within 1 % of where it should. Less by the square of e_0 / e where a cell leans or
+bends: a ball is pressed by its springs."""
 NEAR = wp.constant(wp.float64(0.5))
 """Share of that bound, as a gap, beyond which a cell is level and nothing around it counts, as it cannot touch but by
 an impact: what flies past a shape must not feel that it might lean against it."""
@@ -133,7 +134,8 @@ def cell_at(shape: CellShape, F: wp.mat33d, n: wp.vec3d, gap: wp.float64, closin
     tilt = wp.length(lean)
     cell = Cell()
     cell.onset = wp.sqrt(shape.least * shape.least + shape.bend * shape.bend + tilt * tilt)
-    cell.lead = half * (cell.onset - shape.bend) - LATE * shape.least
+    level = shape.least / cell.onset
+    cell.lead = half * (cell.onset - shape.bend) - LATE * level * level * shape.least
     if tilt > LEVEL * shape.least:
         q = cell.lead - gap - closing
         at = half * shape.width
