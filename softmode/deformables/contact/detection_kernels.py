@@ -400,6 +400,10 @@ def find_contacts(
                 along = inner / depth
                 end = 2.0 * depth
                 back = 1
+            elif kind == BOX and query.distance <= 0.0 and wp.dot(query.normal, inner) < OPPOSED * depth:
+                along = inner / depth
+                end = 0.3 * OVERLAP * instances.size[i]
+                back = 1
         if end == 0.0 and query.distance > 0.0 and travel > instances.margin[i] and travel > query.distance:
             # a half-space at the start would also stop fast samples that fly past a small shape
             along = wp.quat_rotate_inv(turn, drift) / travel
