@@ -210,10 +210,13 @@ def normal_potential(
 ) -> np.ndarray:
     """Return the contact potential per unit stiffness: a dented penalty, one nine times as stiff from ``depth`` on.
 
-    Edges of a box are a penalty of their own stiffness, ``ridge_lead`` deeper in.
+    Edges of a box are a penalty of their own stiffness, ``ridge_lead`` deeper in, until the face presses as much; from
+    there on both together are as stiff as the face.
     """
-    faces = dented_penalty(penetration, eps, ratio) + 9.0 * penalty(penetration - depth, 2.0 * eps)
-    return faces + ridge * penalty(penetration + ridge_lead, eps)
+    left = 1.0 - ridge * (1.0 + ratio)
+    face = left * dented_penalty(penetration - ridge * (1.0 + ratio) / left * ridge_lead, eps, ratio)
+    edges = ridge * penalty(penetration + ridge_lead, eps)
+    return face + edges + 9.0 * penalty(penetration - depth, 2.0 * eps)
 
 
 def friction_potential(y: np.ndarray, eps: float) -> np.ndarray:
