@@ -47,8 +47,9 @@ sinks in 1.4 to 2.4 mm instead of 7 to 8. Ten times the stiffness throughout cos
 HARDENING_DEPTH = wp.constant(wp.float64(2.0))
 """Penetration beyond which it does besides the dent, in ranges of the onset of a level face."""
 ALONG = wp.constant(wp.float64(0.2))
-"""Largest dent along the surface over that across it. What rolls needs 0.05 mm of it. Without a bound a soft body that
-fingers pinch at few samples gets out from between them: contact there hardens across, and must along."""
+"""Largest dent along the surface over that across it. What rolls needs 0.05 mm of it, what turns under a finger 0.3 mm.
+Without a bound a soft body that fingers pinch at few samples gets out from between them: contact there hardens across,
+and must along."""
 LEAST_ALONG, GROWTH = wp.constant(wp.float64(0.5)), wp.constant(wp.float64(3.0))
 """Dent along the surface over Mindlin's where nothing around is touched, and how much more per share c."""
 HARDENING_RANGE = wp.constant(wp.float64(2.0))
@@ -68,7 +69,10 @@ def penalty(penetration: wp.float64, eps: wp.float64):
 
 @wp.func
 def beside_ridge(ratio: wp.float64, ridge: wp.float64, ridge_lead: wp.float64):
-    """Return what a face adds to the edges in its cell, over the penalty, and how much deeper [m]: the larger counts."""
+    """Return what a face adds to the edges in its cell, over the penalty, and how much deeper [m]: the larger counts.
+
+    Beyond the depth at which both press alike, they are as stiff as the face.
+    """
     share = wp.float64(1.0) / (wp.float64(1.0) + ratio) - ridge
     share = wp.max(share, wp.float64(1.0e-9))
     return share, ridge * ridge_lead / share
