@@ -5,10 +5,10 @@ against each other, each by the twist; friction 0.5, nu 0.3. A box finger is a t
 ball a third of it. Prints torque over that of a rigid square of side 2 a on a half space, 8.3 G a^3 times the twist, or
 of Lubkin's ball (`torsion`), and torque over mu F a.
 
-An eighth of the cube is solved, which is alike under quarter turns about the axis and half turns across it. Elements and
-material are those of `hertz_elements`; the penalty is a thousand times as stiff as the cube across the surface and 200
-times along it. What is pressed is solved at finite strain; what turns is linear about that, condensed to the nodes that
-may be touched.
+An eighth of the cube is solved, which is alike under quarter turns about the axis and half turns across it. Elements
+and material are those of `hertz_elements`; the penalty is a thousand times as stiff as the cube across the surface,
+200 times along it. What is pressed is solved at finite strain; what turns is linear about that, condensed to the nodes
+that may be touched.
 """
 
 from __future__ import annotations
