@@ -118,6 +118,44 @@ def test_ridges() -> None:
     np.testing.assert_allclose(out.numpy(), expected, rtol=1.0e-6, atol=1.0e-9)  # reach is a float32
 
 
+def test_torsion() -> None:
+    """Two box fingers, pressed in by an eighth of their half width a, stick as rigid squares: 8.3 G a^3 to 0.2.
+
+    What lies under their rims is pressed back, not aside: before they turn, their torque is 2 % of mu F a at most.
+    """
+    a, mu, depth, twist = EDGE / 6.0, 0.5, 0.02 * EDGE, 0.01
+
+    def populate(world: newton.ModelBuilder) -> None:
+        add_reduced_body(
+            world, default_cube(), material=Material(youngs_modulus=MODULUS, friction=mu, mass_damping=50.0)
+        )
+        for _ in range(2):
+            config = newton.ModelBuilder.ShapeConfig(mu=mu)
+            world.add_shape_box(world.add_body(is_kinematic=True), hx=a, hy=a, hz=PLATE, cfg=config)
+
+    scene = Scene(populate, [default_cube()], dt=0.01)
+    torque = []
+    for k in range(30):
+        angle, rate = (0.0, 0.0) if k < 20 else (twist * min((k - 19) / 5.0, 1.0), 20.0 * twist * (k < 25))
+        poses, twists = np.zeros((2, 7), dtype=np.float32), np.zeros((2, 6), dtype=np.float32)
+        for side, sign in enumerate((-1.0, 1.0)):
+            half = 0.5 * sign * (angle - 0.01 * rate)
+            poses[side] = 0.0, 0.0, sign * (0.5 * EDGE + PLATE - depth), 0.0, 0.0, np.sin(half), np.cos(half)
+            twists[side, 5] = sign * rate
+        for state in (scene.state, scene.next_state):
+            state.body_q.assign(poses)
+            state.body_qd.assign(twists)
+        scene.step()
+        constraints = scene.reduced.view.constraints
+        count = int(constraints.count.numpy()[0])
+        shape, force, arm = (getattr(constraints, name).numpy()[0, :count] for name in ("shape", "force", "arm"))
+        torque.append(float(np.cross(arm, force)[shape == 1, 2].sum()))
+        pressed = float(-force[shape == 1, 2].sum())
+    assert abs(torque[19]) < 0.02 * mu * pressed * a
+    stiffness = 8.3 * MODULUS / 2.6 * a**3
+    assert (torque[-1] - torque[19]) / twist == pytest.approx(stiffness, rel=0.2)
+
+
 def test_an_edge_presses_without_a_jump() -> None:
     """As an edge goes in, no step of the force is twice the mean one, while samples and faces come to touch."""
     edged, deepest, count = Edged("wedge"), 0.04, 40
