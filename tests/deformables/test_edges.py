@@ -140,7 +140,8 @@ def test_torsion() -> None:
         poses, twists = np.zeros((2, 7), dtype=np.float32), np.zeros((2, 6), dtype=np.float32)
         for side, sign in enumerate((-1.0, 1.0)):
             half = 0.5 * sign * (angle - 0.01 * rate)
-            poses[side] = 0.0, 0.0, sign * (0.5 * EDGE + PLATE - depth), 0.0, 0.0, np.sin(half), np.cos(half)
+            z = sign * (0.5 * EDGE + PLATE - depth)
+            poses[side] = -0.004, 0.005, z, 0.0, 0.0, np.sin(half), np.cos(half)  # samples lie under its rim
             twists[side, 5] = sign * rate
         for state in (scene.state, scene.next_state):
             state.body_q.assign(poses)
