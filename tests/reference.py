@@ -251,9 +251,9 @@ def friction_potential(y: np.ndarray, eps: float) -> np.ndarray:
 def stick_potential(y: np.ndarray, limit: float, stiffness: float, deep: float, depth: float) -> np.ndarray:
     """Return the energy [J] of a spring that slips at the force limit: the integral of min(force, limit).
 
-    The force is k y up to a fifth of the dent, and grows by ``deep`` from there on.
+    The force is k y up to 0.15 of the dent, and grows by ``deep`` from there on.
     """
-    bend = 0.2 * depth
+    bend = 0.15 * depth
     most = limit / stiffness if limit <= stiffness * bend else bend + (limit - stiffness * bend) / deep
     x = np.minimum(y, most)
     return 0.5 * stiffness * x**2 + 0.5 * (deep - stiffness) * np.maximum(x - bend, 0.0) ** 2 + limit * (y - x)

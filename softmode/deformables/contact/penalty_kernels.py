@@ -46,7 +46,7 @@ HARDENING = wp.constant(wp.float64(9.0))
 sinks in 1.4 to 2.4 mm instead of 7 to 8. Ten times the stiffness throughout costs light bodies momentum."""
 HARDENING_DEPTH = wp.constant(wp.float64(2.0))
 """Penetration beyond which it does besides the dent, in ranges of the onset of a level face."""
-ALONG = wp.constant(wp.float64(0.2))
+ALONG = wp.constant(wp.float64(0.15))
 """Largest dent along the surface over that across it. What rolls needs 0.05 mm of it, what turns under a finger 0.3 mm.
 Without a bound a soft body that fingers pinch at few samples gets out from between them: contact there hardens across,
 and must along."""
