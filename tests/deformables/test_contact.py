@@ -155,7 +155,8 @@ def stiffness_per_area(scene, instance=0):
 def test_stiffness_and_size_of_the_penalty():
     """At rest under a pressure P = m g / A a face sinks x with kappa (x - eps / 2) = P, or kappa x^2 / (2 eps).
 
-    Of the onset 0.41 sqrt(E / E_c) lie outside. A face that touches as a whole has 2 % of its dents, in series with the penalty.
+    Of the onset 0.41 sqrt(E / E_c) lie outside. A face that touches as a whole has 2 % of its dents, in series with the
+    penalty.
     """
     material = Material(youngs_modulus=1.0e7, mass_damping=5.0)
     scene = on_shape(lambda w: w.add_ground_plane(), height=0.0, material=material)
