@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import platform
 import sys
 import time
@@ -217,6 +218,8 @@ class _Run:
                 fits = {k: v.shape for k, v in module.state_dict().items()} == {k: v.shape for k, v in arrays.items()}
                 if fits or name == "actor" or options.resume:  # else a critic of another kind, which starts anew
                     module.load_state_dict(arrays, strict=True)
+            if not options.resume and "initial_std" in options.overrides:
+                self.model.actor.log_std.data.fill_(math.log(self.hyperparameters.initial_std))
             if options.resume:
                 self.ppo.optimizer.load({k: torch.from_numpy(a) for k, a in start.part("optimizer").items()})
         except (RuntimeError, ValueError) as error:

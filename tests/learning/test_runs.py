@@ -192,12 +192,14 @@ def test_resumption_is_refused_where_it_cannot_work(tmp_path: Path):
 
 
 def test_init_starts_from_a_policy(tmp_path: Path):
-    """The actor is the given one while the critic alone warms up; a policy of other spaces is refused."""
+    """The actor is the given one while the critic warms up, with the noise asked for; other spaces are refused."""
     first = run(tmp_path / "first", 640)
     options = Hyperparameters(**{**SMALL.to_json(), "hidden": (16,), "critic_warmup": 100})
-    second = run(tmp_path / "second", 320, init=first.run_dir / "latest.npz", hyperparameters=options)
+    more = {"hyperparameters": options, "overrides": {"initial_std": 0.3}}
+    second = run(tmp_path / "second", 320, init=first.run_dir / "latest.npz", **more)
     old, new = (read_checkpoint(r.run_dir / "latest.npz").arrays for r in (first, second))
     assert np.array_equal(old["actor.mean.0.weight"], new["actor.mean.0.weight"])
+    np.testing.assert_allclose(np.exp(new["actor.log_std"]), 0.3, rtol=1e-6)
     assert not np.array_equal(old["critic.value.0.weight"], new["critic.value.0.weight"])
     with pytest.raises(CheckpointError, match="Point"):
         run(tmp_path / "third", 64, env="Other", init=first.run_dir / "latest.npz")
