@@ -67,15 +67,7 @@ def plan(model: SoftVectorEnv, state: EnvState, mean: Array, random: np.random.G
 def drive(
     env: gym.Env, model: SoftVectorEnv, seed: int, plans: int, watch: Callable[[], object] = lambda: None
 ) -> tuple[list[float], list[float], dict[str, Any]]:
-    """Play an episode until the disc is there; return distances to the goal, errors of predictions, the last info.
-
-    Args:
-        env: The arm.
-        model: Worlds to try pushes in.
-        seed: Of the episode and the search.
-        plans: How many to make at most.
-        watch: Called after every control step.
-    """
+    """Make plans until the disc is there; return distances to the goal, errors of predictions, the last info."""
     base: Any = env.unwrapped
     random, mean = np.random.default_rng(seed), np.zeros((KNOTS, AXES), np.float32)
     observation, info = env.reset(seed=seed)
@@ -113,13 +105,11 @@ def main(arguments: list[str] | None = None) -> None:
     base: Any = env.unwrapped
     model: Any = gym.make_vec(ENV, num_envs=worlds, config=config, autoreset_mode=AutoresetMode.DISABLED)
     with Film(Path("out/mpc_push.mp4")) as film:
-        distances, errors, info = drive(
-            env, model, given.seed, plans, lambda: film.add(env.render(), env.metadata["render_fps"])
-        )
+        fps = env.metadata["render_fps"]
+        distances, errors, info = drive(env, model, given.seed, plans, lambda: film.add(env.render(), fps))
         film.publish()
-    print(
-        f"{'success' if info['is_success'] else 'not there'} after {HOLD * len(errors)} control steps, {worlds} worlds"
-    )
+    ending = "success" if info["is_success"] else "not there"
+    print(f"{ending} after {HOLD * len(errors)} control steps, {worlds} worlds")
     print(f"wrote {film.path} and {film.sheet_path}")
     test_final(distances, errors, info["is_success"], given.short, exact=base.task.device.is_cpu)
     env.close()
