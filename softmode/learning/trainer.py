@@ -37,7 +37,7 @@ from softmode.learning.environments import make_vector_env
 from softmode.learning.nan_guard import NanGuard
 from softmode.learning.networks import Actor, ActorCritic
 from softmode.learning.policy import EVALUATION_SEED, SELECTION_SEED, Policy, actor_of, evaluate, film_episode
-from softmode.learning.ppo import PPO, STATE
+from softmode.learning.ppo import MIN_LEARNING_RATE, PPO, STATE
 from softmode.learning.rollout import Collector, Rollout
 from softmode.learning.run_folder import BEST, LATEST, RunFolder
 from softmode.learning.train_options import DEFAULT_STEPS, TrainOptions, TrainResult
@@ -349,7 +349,12 @@ class _Run:
         if self.iteration <= self.warm_until:
             losses = torch.zeros(len(PPO.LOSSES), device=self.device)
         else:
-            train_actor = self.iteration - self.warm_until > self.hyperparameters.critic_warmup or self.resumed > 0
+            after = self.iteration - self.warm_until - self.hyperparameters.critic_warmup
+            train_actor = after > 0 or self.resumed > 0
+            if after == 1 and self.options.init is not None:
+                # What an actor has learnt is lost in a few large steps; the schedule finds how large they may be.
+                adaptive = self.hyperparameters.schedule == "adaptive"
+                self.ppo.optimizer.restart(MIN_LEARNING_RATE if adaptive else self.hyperparameters.learning_rate)
             losses = self.ppo.update(rollout, self.generator, progress, train_actor)
         self.collector.update_moments(self.ppo.reward_moments, self.ranks)
         return losses

@@ -209,6 +209,16 @@ def test_init_starts_from_a_policy(tmp_path: Path):
     assert not (tmp_path / "fourth").exists()
 
 
+def test_what_an_actor_has_learnt_survives_its_first_update(tmp_path: Path):
+    """However long the critic warmed up, and though the noise is small, it moves by no more than the schedule wants."""
+    narrow = {**SMALL.to_json(), "hidden": (256,), "max_std": 0.03, "initial_std": 0.03}
+    first = run(tmp_path / "first", 640, hyperparameters=Hyperparameters(**narrow))
+    options = Hyperparameters(**{**narrow, "critic_warmup": 30})
+    run(tmp_path / "second", 64 * 34, init=first.run_dir / "latest.npz", hyperparameters=options)
+    moved = [float(row["divergence"]) for row in rows(tmp_path / "second")]
+    assert max(moved[:31]) < 1e-6 < max(moved[31:]) < 4.0 * options.desired_kl, moved
+
+
 @pytest.mark.parametrize("reward_nan", [False, True])
 def test_the_guard_writes_what_led_to_a_bad_value(tmp_path: Path, reward_nan: bool):
     """World 5 is spoilt in step 45: the file holds its last steps up to there, the earlier checkpoint stays."""

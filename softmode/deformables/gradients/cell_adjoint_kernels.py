@@ -223,7 +223,7 @@ def accumulate_cells(
     firm = surface.relative_stiffness[row] * surface.slenderness[row]
     powers = stiffness_exponents(instances, i, BULK_FACTOR, firm, shape_area(shapes, shape), dt)
     powers = by_log * (powers + dent_exponents(instances, i))
-    sums.contact[i, e] = sums.contact[i, e] + powers + wp.vec4d(zero, zero, zero, by_scale)
+    sums.contact[i, e] = sums.contact[i, e] + powers + wp.vec4d(zero, by_shape.poissons_ratio, zero, by_scale)
 
 
 @wp.kernel
