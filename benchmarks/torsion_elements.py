@@ -110,7 +110,7 @@ class Finger:
 
 def towards(end: float, count: int, first: float) -> Array:
     """Return ``count`` growing steps from 0 to an end, the first about so long."""
-    low, high = 1.0 + 1.0e-6, 4.0
+    low, high, ratio = 1.0 + 1.0e-6, 4.0, 2.0
     for _ in range(60):
         ratio = 0.5 * (low + high)
         low, high = (ratio, high) if first * (ratio**count - 1.0) / (ratio - 1.0) < end else (low, ratio)
@@ -177,7 +177,8 @@ def twisted(kind: str, depth: float) -> tuple[float, list[float]]:
         P, tangent = stress(F, NU)
         blocks = matrix.swapaxes(1, 2) @ (tangent * weight[:, None, None]) @ matrix
         H = sparse.csr_matrix((blocks.reshape(8, -1, 24, 24).sum(axis=0).ravel(), (rows, columns)), (x.size,) * 2)
-        return np.bincount(dofs.ravel(), np.einsum("eij,ei,e->ej", matrix, P, weight).ravel(), x.size), H
+        forces = np.einsum("eij,ei,e->ej", matrix, P, weight)
+        return np.asarray(np.bincount(dofs.ravel(), forces.ravel(), x.size), dtype=float), H
 
     def top() -> Array:
         return (x + u.reshape(x.shape))[nodes]
@@ -212,6 +213,7 @@ def twisted(kind: str, depth: float) -> tuple[float, list[float]]:
     pressed = force[near].ravel()
     for angle in TWISTS:
         finger.move(start, depth, angle)
+        place, now = start, force
         for turn in range(400):
             place = start.copy()
             place[near] += (part @ w).reshape(-1, 3)

@@ -134,7 +134,7 @@ def test_torsion() -> None:
             world.add_shape_box(world.add_body(is_kinematic=True), hx=a, hy=a, hz=PLATE, cfg=config)
 
     scene = Scene(populate, [default_cube()], dt=0.01)
-    torque = []
+    torque, pressed = [], 0.0
     for k in range(30):
         angle, rate = (0.0, 0.0) if k < 20 else (twist * min((k - 19) / 5.0, 1.0), 20.0 * twist * (k < 25))
         poses, twists = np.zeros((2, 7), dtype=np.float32), np.zeros((2, 6), dtype=np.float32)
