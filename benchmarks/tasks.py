@@ -1,8 +1,9 @@
 """Tasks against methods: how often each succeeds, and how gently; the page docs/benchmark_tasks.md.
 
 Run: ``python -m benchmarks.tasks`` writes the page from docs/data/tasks.csv. ``python -m benchmarks.tasks scripted
-LiftSoft --episodes 50`` plays a cell and adds its row. In place of ``scripted`` it takes the file of a policy, with
-``--method``, ``--steps``, ``--seconds``, ``--seed`` and ``--machine`` of its training.
+LiftSoft --episodes 50`` plays a cell and adds its row. In place of ``scripted`` it takes ``MPC``, or the file of a
+policy (.npz of softmode, .zip of Stable-Baselines3's SAC), with ``--method``, ``--steps``, ``--seconds``, ``--seed``
+and ``--machine`` of its training.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 
 import softmode
 from softmode.learning.intervals import wilson_interval
@@ -55,7 +57,9 @@ def cell(task: str, method: str) -> tuple[str, str]:
         return (f"python examples/train_sb3.py --env {env}", "") if goals else ("", "observations have no goal")
     if method == "behaviour cloning":
         return f"python examples/behaviour_cloning.py --env {env}", ""
-    return ("python examples/mpc_push.py", "") if task == "PushSoft" else ("", "no example yet")
+    if task != "PushSoft":
+        return "", "no example yet"
+    return "python -m benchmarks.tasks MPC PushSoft --episodes 20", ""
 
 
 def known() -> list[dict[str, str]]:
@@ -89,6 +93,32 @@ def page(rows: list[dict[str, str]]) -> str:
     return text
 
 
+def play_mpc(episodes: int, seed: int, worlds: int = 32) -> tuple[int, int]:
+    """Return in how many episodes examples/mpc_push.py succeeded, and in how many safely; the arm rests once it has."""
+    from examples.mpc_push import ENV, PLANS, actions_of, drive
+
+    env: Any = gym.make(ENV)
+    model: Any = gym.make_vec(ENV, num_envs=worlds, autoreset_mode="Disabled")
+    won = safe = 0
+    for episode in range(seed, seed + episodes):
+        _, _, info = drive(env, model, episode, PLANS)
+        done = False
+        while not done:
+            *_, terminated, truncated, info = env.step(actions_of(np.zeros(2, np.float32)))
+            done = terminated or truncated
+        won, safe = won + info["is_success"], safe + info["is_safe_success"]
+    return int(won), int(safe)
+
+
+def sac_player(path: str) -> Any:
+    """Return the policy that examples/train_sb3.py wrote."""
+    from stable_baselines3 import SAC
+
+    without = {"replay_buffer_class": None, "replay_buffer_kwargs": {}}
+    model = SAC.load(path, custom_objects=without, device="cpu")
+    return lambda seen: model.predict(seen, deterministic=True)[0]
+
+
 def play(task: str, policy: str, episodes: int, seed: int, device: str | None) -> tuple[int, int]:
     """Return in how many episodes a policy succeeded, and in how many safely."""
     from benchmarks.robustness import last_infos
@@ -96,11 +126,13 @@ def play(task: str, policy: str, episodes: int, seed: int, device: str | None) -
     from softmode.learning.config_values import with_config
     from softmode.learning.policy import load_policy
 
-    trained = None if policy == "scripted" else load_policy(policy)
+    if policy == "MPC":
+        return play_mpc(episodes, seed)
+    trained = None if policy == "scripted" or policy.endswith(".zip") else load_policy(policy)
     whole = {"terminate_when_rough": False}
     options: dict[str, Any] = {} if trained is None else with_config(trained.env, {**trained.env_options, **whole})
     env: Any = gym.make_vec(IDS[task], num_envs=episodes, autoreset_mode="Disabled", device=device, **options)
-    player: Any = scripted_policy(env) if trained is None else trained
+    player: Any = trained or (scripted_policy(env) if policy == "scripted" else sac_player(policy))
     observation, _ = env.reset(seed=seed)
     found = last_infos(env, player, observation)
     env.close()
@@ -110,7 +142,7 @@ def play(task: str, policy: str, episodes: int, seed: int, device: str | None) -
 def main(arguments: list[str] | None = None) -> None:
     """Play a cell, if one is given, and write the page."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("policy", nargs="?", help="scripted, or the file of a policy")
+    parser.add_argument("policy", nargs="?", help="scripted, MPC, or the file of a policy")
     parser.add_argument("task", nargs="?", choices=tuple(IDS))
     parser.add_argument("--method", choices=METHODS)
     parser.add_argument("--episodes", type=int, default=50)
@@ -120,11 +152,11 @@ def main(arguments: list[str] | None = None) -> None:
         parser.add_argument(f"--{name}", default="")
     parser.add_argument("--machine", default="one core")
     args = parser.parse_args(arguments)
-    if args.policy and not (args.task and (args.method or args.policy == "scripted")):
+    if args.policy and not (args.task and (args.method or args.policy in METHODS)):
         parser.error("give the task, and --method with the file of a policy")
     rows = known()
     if args.policy:
-        method = args.method or "scripted"
+        method = args.method or args.policy
         won, safe = play(args.task, args.policy, args.episodes, args.first_seed, args.device)
         commit = subprocess.run(
             ["git", "rev-parse", "--short=7", "HEAD"], capture_output=True, text=True

@@ -9,6 +9,7 @@ Run: ``python examples/mpc_push.py [--worlds 256] [--seed 3] [--short]``, writes
 """
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,8 @@ from softmode.viz import Film
 
 ENV, AXES = "softmode/PushSoft-v0", 2  # the tool moves in x and y, its height and its fingers stay
 KNOTS, HOLD = 3, 8  # a push is so many actions, each held for so many control steps
-ROUNDS, ELITE, FLOOR = 2, 0.1, 0.1  # of the search; share of the worlds that the next round follows; least spread
+PLANS, ROUNDS = 15, 2  # of an episode at most, and of a plan's search
+ELITE, FLOOR = 0.1, 0.1  # share of the worlds that the next round follows; least spread
 
 Array = NDArray[np.floating]
 
@@ -62,6 +64,26 @@ def plan(model: SoftVectorEnv, state: EnvState, mean: Array, random: np.random.G
     return best, found
 
 
+def drive(
+    env: gym.Env, model: SoftVectorEnv, seed: int, plans: int, watch: Callable[[], object] = lambda: None
+) -> tuple[list[float], list[float], dict[str, Any]]:
+    """Make plans until the disc is there; return distances to the goal, errors of predictions, the last info."""
+    base: Any = env.unwrapped
+    random, mean = np.random.default_rng(seed), np.zeros((KNOTS, AXES), np.float32)
+    observation, info = env.reset(seed=seed)
+    distances, errors = [info["goal_distance"]], []
+    while len(errors) < plans and not info["is_success"]:
+        push, predicted = plan(model, base.get_state(), mean, random)
+        for _ in range(HOLD):
+            observation, *_, info = env.step(actions_of(push[0]))
+            watch()
+        errors.append(float(np.abs(observation - predicted).max()))
+        distances.append(info["goal_distance"])
+        print(f"plan {len(errors):2d}: {100 * distances[-1]:5.2f} cm to the goal, prediction off by {errors[-1]:.1e}")
+        mean = np.concatenate([push[1:], np.zeros((1, AXES), np.float32)])
+    return distances, errors, info
+
+
 def test_final(distances: list[float], errors: list[float], success: bool, short: bool, exact: bool) -> None:
     """The disc came to rest at its goal, or nearer in the short run, and every prediction came true."""
     assert max(errors) == 0.0 if exact else max(errors) < 0.05
@@ -77,32 +99,17 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--short", action="store_true", help="8 worlds, three plans, small pictures")
     given = parser.parse_args(arguments)
     wp.config.log_level = wp.LOG_WARNING
-    worlds, plans, edge = (8, 3, 96) if given.short else (given.worlds, 15, 256)
+    worlds, plans, edge = (8, 3, 96) if given.short else (given.worlds, PLANS, 256)
     config = PushSoftConfig(render_size=edge)
     env = gym.make(ENV, render_mode="rgb_array", config=config)
     base: Any = env.unwrapped
     model: Any = gym.make_vec(ENV, num_envs=worlds, config=config, autoreset_mode=AutoresetMode.DISABLED)
-    random, mean = np.random.default_rng(given.seed), np.zeros((KNOTS, AXES), np.float32)
-    observation, info = env.reset(seed=given.seed)
-    distances, errors = [info["goal_distance"]], []
     with Film(Path("out/mpc_push.mp4")) as film:
-        for number in range(plans):
-            push, predicted = plan(model, base.get_state(), mean, random)
-            for _ in range(HOLD):
-                observation, *_, info = env.step(actions_of(push[0]))
-                film.add(env.render(), env.metadata["render_fps"])
-            errors.append(float(np.abs(observation - predicted).max()))
-            distances.append(info["goal_distance"])
-            print(
-                f"plan {number + 1:2d}: {100 * distances[-1]:5.2f} cm to the goal, prediction off by {errors[-1]:.1e}"
-            )
-            mean = np.concatenate([push[1:], np.zeros((1, AXES), np.float32)])
-            if info["is_success"]:
-                break
+        fps = env.metadata["render_fps"]
+        distances, errors, info = drive(env, model, given.seed, plans, lambda: film.add(env.render(), fps))
         film.publish()
-    print(
-        f"{'success' if info['is_success'] else 'not there'} after {HOLD * len(errors)} control steps, {worlds} worlds"
-    )
+    ending = "success" if info["is_success"] else "not there"
+    print(f"{ending} after {HOLD * len(errors)} control steps, {worlds} worlds")
     print(f"wrote {film.path} and {film.sheet_path}")
     test_final(distances, errors, info["is_success"], given.short, exact=base.task.device.is_cpu)
     env.close()

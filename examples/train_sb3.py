@@ -6,6 +6,7 @@ Run: ``python examples/train_sb3.py --env softmode/LiftSoft-v0 --device cuda:0 -
 """
 
 import argparse
+import time
 from pathlib import Path
 
 import gymnasium as gym
@@ -57,6 +58,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--device", default="cpu", help="of the simulation")
     parser.add_argument("--num-envs", type=int, default=16)
     parser.add_argument("--steps", type=int, default=1_000_000, help="environment steps of all worlds together")
+    parser.add_argument("--time-limit", type=float, default=float("inf"), help="seconds after which training ends")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("out/sb3_policy.zip"))
     parser.add_argument("--short", action="store_true", help="a few seconds")
@@ -76,7 +78,9 @@ def main(arguments: list[str] | None = None) -> None:
 
     model = make_model(vec_env, options.steps, options.seed)
     before = parameters(model)
-    model.learn(total_timesteps=options.steps)
+    start = time.perf_counter()
+    model.learn(total_timesteps=options.steps, callback=lambda *_: time.perf_counter() - start < options.time_limit)
+    print(f"{model.num_timesteps} steps in {time.perf_counter() - start:.0f} s")
     ended = len(model.ep_info_buffer or ())
     options.out.parent.mkdir(parents=True, exist_ok=True)
     model.save(options.out)
@@ -90,7 +94,9 @@ def main(arguments: list[str] | None = None) -> None:
         total += rewards
         won |= [info["is_success"] for info in infos]
     print(f"return {total.mean():.2f}, success {100.0 * won.mean():.0f} % of {options.num_envs} episodes")
-    test_final(before, model, again, min(options.steps // options.num_envs // length * options.num_envs, 100), ended)
+    test_final(
+        before, model, again, min(model.num_timesteps // options.num_envs // length * options.num_envs, 100), ended
+    )
     vec_env.close()
 
 

@@ -67,6 +67,19 @@ class Dataset:
         part = slice(self.episode_start[number], self.episode_stop[number])
         return {name: column[part] for name, column in self.columns.items()}
 
+    def observations(self) -> dict[str, NDArray[np.float32]]:
+        """Return the vectors observed in all frames by their keys: ``state``, or those of an environment with goals.
+
+        Raises:
+            ConfigError: If none were read.
+        """
+        given = self.columns
+        parts = [given[key] for key in ("observation.state", "observation.environment_state") if key in given]
+        if not parts:
+            raise ConfigError("no observation.state was read", hint="record with obs_type 'state', and read that key")
+        goals = {key: given[f"observation.{key}"] for key in schema.GOALS if f"observation.{key}" in given}
+        return {"observation" if goals else "state": np.concatenate(parts, axis=1), **goals}
+
     def state(self, number: int) -> EnvState:
         """Return the state in which an episode began, for ``reset(options={"state": state})``.
 

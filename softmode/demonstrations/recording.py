@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium.spaces import Box
 
 from softmode.checks import SEED_MAX, require_number
-from softmode.demonstrations.schema import Feature
+from softmode.demonstrations.schema import GOALS, Feature
 from softmode.demonstrations.writer import DatasetWriter
 from softmode.errors import ConfigError
 
@@ -41,10 +41,11 @@ def environment_features(
 
     The proprioception is ``observation.state``, the rest of a state vector ``observation.environment_state``, pictures
     are ``observation.images.CAMERA``; further there are ``action`` and what it led to, ``next.reward``, ``next.done``
-    and ``next.success``.
+    and ``next.success``. Goals are ``observation.achieved_goal`` and ``observation.desired_goal``.
 
     Args:
-        env: An environment whose observations are a vector, a picture, or a dict of ``pixels`` and ``agent_pos``.
+        env: An environment whose observations are a vector, a picture, a dict of ``pixels`` and ``agent_pos``, or one
+            with goals.
         pictures: How pictures are stored.
         camera: Name of the camera.
 
@@ -61,9 +62,13 @@ def environment_features(
         if isinstance(part, Box) and part.dtype == np.uint8 and len(part.shape) == 3 and key in ("", "pixels"):
             kind = "video" if pictures == "video" else "image"
             features[f"observation.images.{camera}"] = Feature(dtype=kind, shape=part.shape)
-        elif isinstance(part, Box) and len(part.shape) == 1 and key in ("", "agent_pos"):
+        elif isinstance(part, Box) and key in GOALS:
+            features[f"observation.{key}"] = Feature(dtype="float32", shape=part.shape)
+        elif isinstance(part, Box) and len(part.shape) == 1 and key in ("", "agent_pos", "observation"):
             # The leading numbers are the robot's own; all, if the environment does not tell.
             names, count, total = _names(task), 1 << 30 if task is None else task.layout.agent_size, part.shape[0]
+            if key == "observation":  # of an environment with goals, which has its own order
+                names, count = None, total
             for name, columns in (
                 ("observation.state", slice(0, min(count, total))),
                 ("observation.environment_state", slice(count, total)),
@@ -106,9 +111,11 @@ def observation_columns(observation: Any, features: Mapping[str, Feature]) -> di
     """
     parts = observation if isinstance(observation, Mapping) else {"": observation}
     columns: dict[str, Any] = {}
-    for part in parts.values():
+    for key, part in parts.items():
         part = np.asarray(part)
-        if part.ndim == 3:
+        if key in GOALS:
+            columns[f"observation.{key}"] = part
+        elif part.ndim == 3:
             (name,) = (name for name in features if name.startswith("observation.images."))
             columns[name] = part
         else:

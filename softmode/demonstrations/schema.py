@@ -41,6 +41,8 @@ INFO_PATH, STATISTICS_PATH, TASKS_PATH = "meta/info.json", "meta/stats.json", "m
 ORIGINS_PATH, CARD_PATH = "meta/softmode.json", "README.md"
 STATE_PATH = "meta/states/episode-{number:06d}.npz"
 IMAGE_NAMES = ("height", "width", "channels")
+GOALS = ("achieved_goal", "desired_goal")
+"""Keys of the goals in observations of environments with goals; their features are ``observation.KEY``."""
 
 
 def place_of(number: int) -> dict[str, int]:
