@@ -163,11 +163,11 @@ def test_force_stays_in_the_cone():
     """|f_t| <= mu f_n in every contact of every step, sticking and sliding; and it opposes the slip.
 
     The f_n of friction is that of the contact to rounding, but in the first step, which needs ten iterations: it is
-    frozen after eight.
+    frozen after eight, and changes by 3e-4 of the weight in the two that are left.
     """
     scene, along = incline(1.5)
     seen = 0
-    for _ in range(60):
+    for step in range(60):
         scene.step()
         entries = scene.reduced.view.constraints
         count = int(entries.count.numpy()[0])
@@ -177,7 +177,8 @@ def test_force_stays_in_the_cone():
         lagged = entries.normal_force.numpy()[0, :count]
         assert (tangential <= MU * lagged * (1 + 1e-9)).all()
         frozen = scene.reduced.iteration.numpy()[0] > SolverReducedOptions().friction_lag
-        np.testing.assert_allclose(lagged, normal, atol=(2e-4 if frozen else 1e-6) * scene.mass() * GRAVITY)
+        assert not frozen or step == 0
+        np.testing.assert_allclose(lagged, normal, atol=(4e-4 if frozen else 1e-6) * scene.mass() * GRAVITY)
         assert (f @ along <= 1e-9).all()
         seen += int((normal > 0).sum())
     assert seen > 100
