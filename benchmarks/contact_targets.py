@@ -23,7 +23,7 @@ import newton
 import numpy as np
 import trimesh
 import warp as wp
-from scipy.optimize import brentq
+from scipy.optimize import root_scalar
 
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.materials.material import Material
@@ -173,7 +173,8 @@ def rod(radius: float, strain: float, material: Material) -> float:
         across = 4.0 * force * (1.0 - nu**2) / (np.pi * E) * (np.log(4.0 * radius / half) - 0.5)
         return across + 4.0 * nu**2 * force / (np.pi * E)
 
-    return float(brentq(lambda force: approach(force) - 2.0 * radius * strain, 1.0e-9, E * radius))
+    found = root_scalar(lambda force: approach(force) - 2.0 * radius * strain, bracket=(1.0e-9, E * radius))
+    return float(found.root)
 
 
 def ball(modulus: float, ratio: float, share: float) -> Figure:
@@ -264,7 +265,8 @@ def roll(
     before = scene.momentum()[0] @ along / scene.mass()
     scene.step(round(seconds / DT))
     after, status = scene.momentum()[0] @ along / scene.mass(), int(scene.reduced.status.numpy()[0])
-    return (after / before if level else (after - before) / (GRAVITY * np.sin(angle) / (1.0 + share) * seconds)), status
+    gained = float(after / before if level else (after - before) / (GRAVITY * np.sin(angle) / (1.0 + share) * seconds))
+    return gained, status
 
 
 def rest(body: str, modulus: float) -> Figure:

@@ -97,7 +97,10 @@ def test_scripted_policy_leads_the_rope_around_the_pegs(rope: RopeRouteEnv, rout
 
 
 def test_dragging_the_rope_takes_mu_times_its_weight(rope: RopeRouteEnv) -> None:
-    """Pulled along the table at constant speed: f_t = mu (m g - f_z), with mu = sqrt(mu_rope mu_table)."""
+    """Pulled along the table at constant speed: f_t = mu (m g - f_z), with mu = sqrt(mu_rope mu_table).
+
+    Whether the fingers carry the rope's end or press it onto the table is decided by half a millimetre at the start.
+    """
     rope.reset(seed=0, options={"position": (0.36, -0.15), "yaw": 0.0, "youngs_modulus": 6.0e5})
     policy = ScriptedRope(rope)
     while policy._phase != "lead":
@@ -111,7 +114,7 @@ def test_dragging_the_rope_takes_mu_times_its_weight(rope: RopeRouteEnv) -> None
     sideways, along, down = np.mean(forces, axis=0)
     weight = scene.config.material.density * scene.soft.body.volume * 9.81
     mu = np.sqrt(scene.config.material.friction * scene.config.table_friction)
-    assert down < 0.0 and abs(sideways) < 0.2 * weight
+    assert abs(sideways) < 0.2 * weight
     assert -along == pytest.approx(mu * (weight + down), rel=0.1)
 
 
