@@ -46,10 +46,10 @@ class RadianceInfo:
         print(f"size        {row(high - low)}")
         print(f"densities   {row(deciles)}  per unit of length (10, 50, 90 % of what is not empty)")
         print(f"opacities   {row(-np.expm1(-deciles * field.spacing))}  of a voxel, likewise")
-        print(f"solid       {solid.volume:.4g} units of length cubed; half the level of its surface adds {fog:.0%}")
+        print(f"solid       {solid.volume:.4g} units of length cubed; half the level moves its surface by {fog:.2g} voxels")
         print(f"voids       {filled:.0%} of it were filled, {opened:.0%} that only something thin or faint closes")
         if fog > FOGGY:
-            print("            this is fog (walls: 0 to 11 %): the solid is doubtful, and cavities may be full")
+            print("            this is fog (walls: 0 to 0.6): the solid is doubtful, and cavities may be full")
         return 0
 
 

@@ -521,7 +521,7 @@ def _check_asset(body: ReducedBody, told: dict[str, float], notes: _Notes) -> No
         notes.find(
             "warning",
             "fog",
-            f"the field is fog: half the level of its surface adds {100.0 * fog:.0f} % of volume (walls: 0 to 11 %)."
+            f"the field is fog: half the level moves its surface by {fog:.2g} voxels (walls: 0 to 0.6)."
             f" Its solid is taken at {told['quadrature_level_share']:.2g} of full occupancy; cavities may be full",
             "train it with opaque walls (examples/train_field.py), or build from a mesh of the object",
         )
