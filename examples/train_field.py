@@ -3,7 +3,7 @@
 The pictures stand for photographs: the product's camera makes them before a white wall, with a lens that distorts,
 blur, noise and wrong exposure. Training takes two minutes on one core.
 
-Run: ``python examples/train_field.py [--preset bear] [--steps 1500] [--folder out/field] [--short]``
+Run: ``python examples/train_field.py [--preset bear] [--steps 1200] [--folder out/field] [--short]``
 """
 
 import argparse
@@ -89,7 +89,7 @@ def main() -> None:
     """Make pictures, train, load, pull and squeeze; print how well each went."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--preset", default="bear")
-    parser.add_argument("--steps", type=int, default=1500, help="steps of the training")
+    parser.add_argument("--steps", type=int, default=1200, help="steps of the training")
     parser.add_argument("--folder", type=Path, default=Path("out/field"))
     parser.add_argument("--short", action="store_true", help="fewer, smaller pictures and a rough field")
     given = parser.parse_args()

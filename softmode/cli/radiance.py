@@ -23,7 +23,7 @@ class RadianceInfo:
         """Print nodes, degree, box, densities and what solid they show."""
         import numpy as np
 
-        from softmode.deformables.quadrature.quadrature_density import FOGGY, quadrature_from_density
+        from softmode.deformables.quadrature.quadrature_density import DOUBTED, FOGGY, quadrature_from_density
         from softmode.radiance.formats import read_radiance
 
         with quiet_warp():
@@ -46,10 +46,14 @@ class RadianceInfo:
         print(f"size        {row(high - low)}")
         print(f"densities   {row(deciles)}  per unit of length (10, 50, 90 % of what is not empty)")
         print(f"opacities   {row(-np.expm1(-deciles * field.spacing))}  of a voxel, likewise")
-        print(f"solid       {solid.volume:.4g} units of length cubed; half the level moves its surface by {fog:.2g} voxels")
+        print(f"solid       {solid.volume:.4g} units of length cubed; half its level moves it by {fog:.2g} voxels")
         print(f"voids       {filled:.0%} of it were filled, {opened:.0%} that only something thin or faint closes")
         if fog > FOGGY:
             print("            this is fog (walls: 0 to 0.6): the solid is doubtful, and cavities may be full")
+        if field.contradicted is not None:
+            print(f"pictures    contradict a patch of {field.contradicted:.1%} of its surface")
+        if (field.contradicted or 0.0) > DOUBTED:
+            print("            the solid is doubtful: it may be full where the object is hollow")
         return 0
 
 
