@@ -23,7 +23,7 @@ class RadianceInfo:
         """Print nodes, degree, box, densities and what solid they show."""
         import numpy as np
 
-        from softmode.deformables.quadrature.quadrature_density import DOUBTED, FOGGY, quadrature_from_density
+        from softmode.deformables.quadrature.quadrature_density import ALLOWED, DOUBTED, FOGGY, quadrature_from_density
         from softmode.radiance.formats import read_radiance
 
         with quiet_warp():
@@ -50,10 +50,11 @@ class RadianceInfo:
         print(f"voids       {filled:.0%} of it were filled, {opened:.0%} that only something thin or faint closes")
         if fog > FOGGY:
             print("            this is fog (walls: 0 to 0.6): the solid is doubtful, and cavities may be full")
-        if field.contradicted is not None:
-            print(f"pictures    contradict a patch of {field.contradicted:.1%} of its surface")
-        if (field.contradicted or 0.0) > DOUBTED:
-            print("            the solid is doubtful: it may be full where the object is hollow")
+        patch, allowed = field.contradicted or 0.0, field.allowed or 0.0
+        if field.allowed is not None:
+            print(f"pictures    contradict a patch of {patch:.1%} of its surface, allow {allowed:.2g} times its volume")
+        if patch > DOUBTED or allowed > ALLOWED:
+            print("            the solid is doubtful: cavities may be full, or their walls too thick")
         return 0
 
 

@@ -67,7 +67,7 @@ def train_field(
     pictures: Sequence[PosedPicture],
     *,
     wall: Sequence[float] = (1.0, 1.0, 1.0),
-    steps: int = 1200,
+    steps: int = 1000,
     seed: int = 0,
     metres: float | None = None,
     progress: Callable[[int, float], None] | None = None,
@@ -80,7 +80,7 @@ def train_field(
     Args:
         pictures: The pictures; the border of each is the wall. The object is where their axes meet.
         wall: Colour of the wall, sRGB 0..1. Where the object has it too, no picture says where its surface is.
-        steps: Steps; 1,200 take two minutes on one core.
+        steps: Steps; 1,000 take two minutes on one core.
         seed: Seed of rays.
         metres: Metres of a unit of the poses, None if not known.
         progress: Called with the step and the mean squared error after every step.
@@ -169,9 +169,11 @@ def train_field(
     box = np.stack([middle - half, middle + half])
     field = RadianceGrid.from_bounds(density, c[..., None, :], box, name="trained field", metres=metres)
     full = _zoomed(s, COARSE / len(s)) < 0.0
+    core: Any = ndimage.binary_erosion(full)
     patches: Any = ndimage.label(contradicted(pictures, even, full, middle, half), np.ones((3, 3, 3)))
-    share = np.bincount(patches[0].ravel())[1:].max(initial=0) / (full & ~ndimage.binary_erosion(full)).sum()
-    return replace(field.cropped(*field.surroundings), contradicted=float(share))
+    share = np.bincount(patches[0].ravel())[1:].max(initial=0) / (full & ~core).sum()
+    allowed = float(carved.sum() / full.sum())
+    return replace(field.cropped(*field.surroundings), contradicted=float(share), allowed=allowed)
 
 
 def _cube(pictures: Sequence[PosedPicture]) -> tuple[Array, float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +36,8 @@ def contradicted(
         half: Half of its edge.
     """
     line, eye = np.linspace(-half, half, len(full)), pictures[0].camera
-    surface = np.argwhere(full & ~ndimage.binary_erosion(full))
+    core: Any = ndimage.binary_erosion(full)
+    surface = np.argwhere(full & ~core)
     places, voxel = line[surface] + middle, line[1] - line[0]
     wide = voxel * eye.fx / float(np.linalg.norm(np.asarray(eye.position) - middle))
     window, cell = 2 * max(round(wide), 1) + 1, max(round(1.4 * wide), 1)

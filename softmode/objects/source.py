@@ -171,8 +171,8 @@ def _field_source(config: ObjectConfig, given: str | Path | RadianceGrid) -> Obj
         quadrature_from_density, grid.densities, grid.surroundings, surface_count=config.surface_count, **options
     )
     fitted = config.size if config.size is not None or grid.metres else SIZE
-    doubt: dict[str, str | int | float] = {} if grid.contradicted is None else {"contradicted": grid.contradicted}
-    made = ("cut", *key, grid.contradicted or 0.0, config.resolution)
+    doubt: dict[str, str | int | float] = {"contradicted": grid.contradicted or 0.0, "allowed": grid.allowed or 0.0}
+    made = ("cut", *key, *doubt.values(), config.resolution)
     return ObjectSource(baked, solid, grid.name, made, baked.count, fitted, grid, pose, capture=doubt)
 
 

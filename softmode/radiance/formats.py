@@ -23,7 +23,7 @@ from softmode.splats.formats.others import refuse_others
 SUFFIXES = (".npz", ".nvdb")
 """What fields are read from."""
 _OURS = ("density", "sh", "origin", "axes")
-_NUMBERS = ("metres", "contradicted")
+_NUMBERS = ("metres", "contradicted", "allowed")
 _PLAIN = ("density", "bounds")
 _PLENOXELS = ("links", "density_data", "sh_data", "radius", "center")
 _HINT = "export it again"
@@ -71,12 +71,10 @@ def _read_npz(file: Path) -> RadianceGrid:
     names = {*_OURS, *_PLAIN, *_PLENOXELS, *PLENOCTREE, "rgb", "basis_type", *_NUMBERS}
     arrays = read_arrays(file, names, what="radiance field", hint=_HINT, free=_FREE)
     name = file.name
-    metres, doubt = (float(arrays[key]) if key in arrays else None for key in _NUMBERS)
+    known = {key: float(arrays[key]) if key in arrays else None for key in _NUMBERS}
     if set(arrays) >= set(_OURS):
         density, sh, origin, axes = (arrays[key] for key in _OURS)
-        return RadianceGrid(
-            density=density, sh=sh, origin=origin, axes=axes, name=name, metres=metres, contradicted=doubt
-        )
+        return RadianceGrid(density=density, sh=sh, origin=origin, axes=axes, name=name, **known)
     if set(arrays) >= set(_PLENOXELS):
         return _plenoxels(arrays, name)
     if set(arrays) >= set(PLENOCTREE):
@@ -88,7 +86,7 @@ def _read_npz(file: Path) -> RadianceGrid:
             " or child, data, data_format, invradius3 and offset of a PlenOctree",
         )
     sh = arrays["sh"] if "sh" in arrays else _colors(arrays["rgb"], name)
-    return RadianceGrid.from_bounds(arrays["density"], sh, arrays["bounds"], name=name, metres=metres)
+    return RadianceGrid.from_bounds(arrays["density"], sh, arrays["bounds"], name=name, metres=known["metres"])
 
 
 def write_radiance(path: str | os.PathLike[str], field: RadianceGrid) -> None:

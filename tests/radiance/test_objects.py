@@ -167,7 +167,7 @@ def test_commands(file, tmp_path, capsys):
     said = capsys.readouterr().out
     assert "sh degree   0" in said and "97 x" in said and "moves it by 0.0" in said and "fog" not in said
     doubted = tmp_path / "doubted.npz"
-    write_radiance(doubted, replace(block_field(), contradicted=0.06))
+    write_radiance(doubted, replace(block_field(), contradicted=0.06, allowed=1.2))
     assert main(["radiance", "info", str(doubted)]) == 0
     assert "a patch of 6.0%" in (said := capsys.readouterr().out) and "doubtful" in said
     out = tmp_path / "block.ply"

@@ -15,7 +15,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from softmode.deformables.quadrature.interior import Interior, interior_from_quadrature, interior_from_surface
 from softmode.deformables.quadrature.occupancy import KEPT_EXTENT, KEPT_SHARE
-from softmode.deformables.quadrature.quadrature_density import DOUBTED, FOGGY
+from softmode.deformables.quadrature.quadrature_density import ALLOWED, DOUBTED, FOGGY
 from softmode.deformables.reduction.basis import KERNEL_POINTS
 from softmode.deformables.reduction.cubature import POISSON_RATIO
 from softmode.deformables.reduction.elastic_functions import EXCESS, EXCESS_WARNING
@@ -525,14 +525,15 @@ def _check_asset(body: ReducedBody, told: dict[str, float], notes: _Notes) -> No
             f" Its solid is taken at {told['quadrature_level_share']:.2g} of full occupancy; cavities may be full",
             "train it with opaque walls (examples/train_field.py), or build from a mesh of the object",
         )
-    if (doubt := told.get("quadrature_contradicted", 0.0)) > DOUBTED:
+    patch, allowed = told.get("quadrature_contradicted", 0.0), told.get("quadrature_allowed", 0.0)
+    if patch > DOUBTED or allowed > ALLOWED:
         notes.find(
             "warning",
             "doubtful solid",
-            f"the pictures of the field contradict its surface: a patch of {100.0 * doubt:.0f} % of it has one colour"
-            " from some sides and another from others, as the lid of a cavity has. The solid may be full where its"
-            " object is hollow",
-            "train with more pictures that look into its cavities, or build from a mesh of the object",
+            f"the pictures of the field contradict a patch of {100.0 * patch:.1f} % of its surface, as they do with the"
+            f" lid of a cavity, and allow solids of up to {allowed:.1f} times its volume: cavities are too even for"
+            " them to say how deep they are and how thick their walls",
+            "measure a wall, train with more pictures that look into the cavity, or build from a mesh of the object",
         )
     filled, opened = told.get("quadrature_filled_share", 0.0), told.get("quadrature_open_share", 0.0)
     if max(filled, opened) > VOID_SHARE:
