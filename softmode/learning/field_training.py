@@ -42,7 +42,7 @@ WIDEST, SHARPEST, STRIDE = 1.0, 0.4, 0.6
 """beta of a grid at first, and at its end [voxels]; between samples of a ray of the fine grid [voxels]."""
 AT_ONCE = 1 << 16
 """Rays of a picture whose light is followed at a time."""
-FOG, DENSE, LIT = 3.0, 0.7, 0.7
+FOG, DENSE, LIT = 3.0, 0.7, 0.5
 """What nodes of the hull begin with [voxels]: a fortieth of the light is lost in a voxel; below which fog is solid, a
 quarter lost; a node is lit where so much of the light of two pictures comes to it."""
 RATES = (0.1, 0.03, 3.0e-3)
@@ -53,9 +53,9 @@ BAND, AGAIN = 4.0, 150
 """Distance from the surface up to which nodes are learned [voxels], and steps after which it is found anew."""
 EMPTY = 6.0e-8
 """Weight of the light that nodes take as fog, so that there is none where no picture asks for it."""
-THINNER, CRISP = 0.4, 0.1
+THINNER, CRISP, BEFORE = 0.55, 0.1, 0.5
 """On the grid of the field, finer by two: how much its surface lies below s = 0, as its density takes light before its
-half is reached, and its beta [its voxels; nodes]."""
+half is reached, and its beta [its voxels; nodes]; where its colours are taken [nodes before s = 0]."""
 ENOUGH = 2
 """Nodes of a hull that pictures may contradict."""
 SLACK, VOTES, CONTRAST = 2, 2, 0.06
@@ -142,7 +142,7 @@ def train_field(
     for step in range(steps):
         size = FINE if step >= switch else COARSE
         if size != walls.n or (step - fresh >= AGAIN and not foggy and step < 0.9 * steps):
-            walls, fresh, foggy = walls.anew(size, lit(walls)), step, False
+            walls, fresh, foggy = walls.anew(size, lit(walls) if foggy else None), step, False
         part = (step - switch) / (steps - switch) if step >= switch else step / switch
         beta = WIDEST if foggy else WIDEST * (SHARPEST / WIDEST) ** min(part / 0.7, 1.0)
         for group, rate in zip(walls.optimiser.param_groups, RATES, strict=False):
@@ -161,8 +161,8 @@ def train_field(
             optimiser.step()
         if progress is not None:
             progress(step + 1, error.item())
-    s, c = walls.anew(walls.n, lit(walls)).dense()
-    s, c = 2.0 * _zoomed(s, 2.0), _zoomed(c, 2.0)
+    s, c = walls.dense()
+    s, c = 2.0 * _zoomed(s, 2.0), _zoomed(_in_front(s, c), 2.0)
     beta, s = 2.0 * CRISP, s + THINNER
     tail = 0.5 * np.exp(-np.abs(s) / beta)
     density = np.where(s > 0.0, tail, 1.0 - tail) * (len(s) - 1) / (2.0 * half * beta)
@@ -218,6 +218,18 @@ def _zoomed(values: Array, zoom: float) -> Array:
     return found
 
 
+def _in_front(s: Array, c: Array) -> Array:
+    """Return colours (n, n, n, 3) of nodes near a surface where light is lost on its way to them: before s = 0."""
+    near = np.abs(s) < 3.0
+    slopes: Any = np.gradient(ndimage.gaussian_filter(s, 0.5))
+    out = np.stack([slope[near] for slope in slopes])
+    out *= (BEFORE - s[near]) / np.maximum((out**2).sum(axis=0), 0.25)
+    at, moved = np.argwhere(near).T + out, c.copy()
+    for k in range(3):
+        moved[near, k] = ndimage.map_coordinates(c[..., k], at, order=1, mode="nearest")
+    return moved
+
+
 def _reach(walls: Walls, eye: torch.Tensor, way: torch.Tensor, edge: float) -> tuple[torch.Tensor, torch.Tensor]:
     """Return where rays come to the nodes that are learned, and where they leave them; last < first where nowhere."""
     voxel = edge / (walls.n - 1)
@@ -262,17 +274,19 @@ class Walls:
         nearest: Any = ndimage.distance_transform_edt(~self.near, return_distances=False, return_indices=True)
         return s[..., 0], c[tuple(nearest)]
 
-    def anew(self, n: int, lit: np.ndarray) -> Walls:
+    def anew(self, n: int, lit: np.ndarray | None = None) -> Walls:
         """Return them with true distances from the surface of the largest part, perhaps on a finer grid.
 
-        It is full where it is dense, not `lit` (n^3,), or enclosed but for holes of some nodes.
+        What was fog is full where it is dense, not `lit` (n^3,), or enclosed but for holes of some nodes.
         """
         s, c = self.dense()
-        s, zoom = s - DENSE if self.fog else s, n / self.n
-        within: Any = ndimage.binary_erosion(self.near, iterations=2)
-        solid: Any = (s < 0.0) | (within & ~lit.reshape(s.shape))
-        whole: Any = ndimage.binary_fill_holes(ndimage.binary_closing(solid, iterations=2))
-        s = np.where(solid | ndimage.binary_erosion(whole), -np.abs(s), np.abs(s))
+        zoom = n / self.n
+        if lit is not None:
+            s = s - DENSE
+            within: Any = ndimage.binary_erosion(self.near, iterations=2)
+            solid: Any = (s < 0.0) | (within & ~lit.reshape(s.shape))
+            whole: Any = ndimage.binary_fill_holes(ndimage.binary_closing(solid, iterations=2))
+            s = np.where(solid | ndimage.binary_erosion(whole), -np.abs(s), np.abs(s))
         s = _zoomed(np.clip(s, -3.0, 3.0), zoom) * zoom
         found: Any = ndimage.label(s < 0.0)
         parts, count = found
