@@ -530,9 +530,9 @@ def _check_asset(body: ReducedBody, told: dict[str, float], notes: _Notes) -> No
         notes.find(
             "warning",
             "doubtful solid",
-            f"the pictures of the field contradict a patch of {100.0 * patch:.1f} % of its surface, as they do with the"
-            f" lid of a cavity, and allow solids of up to {allowed:.1f} times its volume: cavities are too even for"
-            " them to say how deep they are and how thick their walls",
+            f"its pictures contradict a patch of {100.0 * patch:.1f} % of its surface (a lid over a cavity: 6 and more)"
+            f" and allow solids of up to {allowed:.1f} times its volume, since a cavity of one colour does not show how"
+            " deep it is and how thick its wall",
             "measure a wall, train with more pictures that look into the cavity, or build from a mesh of the object",
         )
     filled, opened = told.get("quadrature_filled_share", 0.0), told.get("quadrature_open_share", 0.0)
