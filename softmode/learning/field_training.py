@@ -2,12 +2,11 @@
 
 The field is a signed distance s [voxels] at the nodes of a sparse grid. Between two places of a ray passes the share
 Phi(s / beta) has there over here, at most all, where Phi is the logistic function and beta shrinks (NeuS, Wang et al.
-2021): half the light is lost at s = 0, seen from the front and along a rim alike. (A density has its rim further out:
-walls of three voxels became two voxels thicker.) On a coarse grid it begins as fog, of density Psi(-s / beta) / beta,
-where Psi is the distribution function of Laplace (VolSDF, Yariv et al. 2021): very thin in the hull of the silhouettes,
-it becomes dense where pictures ask for it. Then what light reaches is empty, and what none reaches is inside. (A hull
-that begins full of matter, or fog that is not thin, keeps a lid on every cavity.) Silhouettes take a backdrop that is
-known.
+2021): half the light is lost at s = 0, seen from the front and along a rim alike. (A density has its rim further out,
+and its walls elsewhere.) On a coarse grid it begins as fog, of density Psi(-s / beta) / beta, where Psi is the
+distribution function of Laplace (VolSDF, Yariv et al. 2021): thin in the hull of the silhouettes, less what their
+colours contradict, it becomes dense where pictures ask for it. Then what light reaches is empty, and what none reaches
+is inside. (Fog in all of the hull puts a lid on every cavity.) Silhouettes take a backdrop that is known.
 """
 
 from __future__ import annotations
