@@ -222,7 +222,8 @@ def _solid(occupancy: Array, fill_voids: bool) -> tuple[Array, float, dict[str, 
     def grows(share: float) -> float:
         """Return by how many voxels half a level moves the surface out."""
         wide, whole = found(0.5 * share)[1], found(share)[1]
-        return float((wide & ~whole).sum() / (whole & ~ndimage.binary_erosion(whole)).sum())
+        core: Any = ndimage.binary_erosion(whole)
+        return float((wide & ~whole).sum() / (whole & ~core).sum())
 
     fog = grows(LEVELS[0])
     share = LEVELS[0] if fog < FOGGY else next((s for s in LEVELS[1:] if grows(s) < FOGGY), LEVELS[-1])
@@ -251,7 +252,8 @@ def _cut(sampler: _Sampler, nodes: Array, solid: Array, level: float) -> None:
     The density there, or half of the largest beyond if that is less, is the level of a voxel's surface.
     """
     full, cube = solid > level, np.ones((3, 3, 3))
-    band: Any = ndimage.binary_dilation(full, cube, 2) & ~ndimage.binary_erosion(full, cube, 2)
+    core: Any = ndimage.binary_erosion(full, cube, 2)
+    band: Any = ndimage.binary_dilation(full, cube, 2) & ~core
     slopes: Any = np.gradient(ndimage.gaussian_filter(np.minimum(solid, 2.0 * level), 1.0))
     out = -np.stack([slope[band] for slope in slopes], axis=1)
     out /= np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-12)
