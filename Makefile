@@ -151,6 +151,7 @@ baselines: $(VENV)/.bench  ## the table and the picture of docs/baselines.md
 coupling: $(VENV)/.dev  ## the tables of docs/coupling.md and docs/contact.md
 	$(BIN)/python -m benchmarks.coupling $(ARGS)
 	$(BIN)/python -m benchmarks.contact
+	$(BIN)/python -m benchmarks.contact_targets --table
 
 docs: $(VENV)/.dev  ## build the documentation: out/docs/index.html, no network needed
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going -b html docs out/docs $(ARGS)

@@ -1,6 +1,6 @@
-"""Iterations of hard impacts, BDF2's order, the momentum of a floating base that a soft cube hits, and a rolling ball.
+"""Iterations of hard impacts, BDF2's order, and the momentum of a floating base that a soft cube hits.
 
-Run: ``python -m benchmarks.impacts [--only drops|order|base|rolling]``.
+Run: ``python -m benchmarks.impacts [--only drops|order|base]``. Rolling balls: `contact_targets`.
 """
 
 from __future__ import annotations
@@ -12,13 +12,9 @@ import newton
 import numpy as np
 import warp as wp
 
-from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_pins, add_reduced_body
 from softmode.deformables.model.status import status_reasons
-from softmode.deformables.quadrature.quadrature import quadrature_from_sphere
-from softmode.deformables.reduction.build_body import build_body
-from softmode.deformables.reduction.options import BuildOptions
 from softmode.deformables.solver.options import Integrator, SolverReducedOptions
 from tests.bodies import bar, cube
 from tests.scenes import GRAVITY, Scene, rotation
@@ -168,39 +164,12 @@ def bases() -> None:
             print(f"  {label}, dt {dt:g}: {linear:.1e}, {angular:.1e}", flush=True)
 
 
-def rolling(degrees: float = 5.0) -> None:
-    """Print how a ball of 50 mm rolls down a slope, over 5/7 g sin, by samples and step, with and without spin kept."""
-    slope = np.radians(degrees)
-    gravity = (GRAVITY * np.sin(slope), 0.0, -GRAVITY * np.cos(slope))
-    for samples in (400, 1500):
-        quadrature = quadrature_from_sphere(0.05, point_count=1000, surface_count=samples)
-        ball = build_body(quadrature, BuildOptions(mode_count=4, kernel_count=150, cubature_count=128))
-        for dt in (1 / 60, 1 / 240):
-            found = [roll(ball, gravity, dt, keep) / (5.0 / 7.0 * gravity[0]) for keep in (True, False)]
-            print(f"{samples} samples, 1/{1 / dt:.0f} s: {found[0]:.3f}, flying straight {found[1]:.3f}", flush=True)
-
-
-def roll(ball: ReducedBody, gravity: tuple[float, float, float], dt: float, keep: bool) -> float:
-    """Return the acceleration of a ball on the ground along X from 0.15 to 0.7 s [m/s^2]."""
-
-    def populate(world: newton.ModelBuilder) -> None:
-        material = Material(youngs_modulus=1.0e5, viscosity=0.0)
-        add_reduced_body(world, ball, material=material, position=(0.0, 0.0, 0.0499))
-
-    scene = Scene(populate, [ball], gravity=gravity, ground=1.0, dt=dt, options=SolverReducedOptions(keep_spin=keep))
-    scene.step(round(0.15 / dt))
-    first = scene.momentum()[0][0]
-    count = round(0.55 / dt)
-    scene.step(count)
-    return (scene.momentum()[0][0] - first) / scene.mass() / (count * dt)
-
-
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", choices=("drops", "order", "base", "rolling"))
+    parser.add_argument("--only", choices=("drops", "order", "base"))
     chosen = parser.parse_args().only
-    for name, work in {"drops": drops, "order": order, "base": bases, "rolling": rolling}.items():
+    for name, work in {"drops": drops, "order": order, "base": bases}.items():
         if chosen in (None, name):
             work()
 

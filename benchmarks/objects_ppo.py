@@ -1,7 +1,6 @@
 """PPO from states for LiftSoft on ten presets, played on them and on five that it never saw.
 
-Of the fifteen presets every third by name is unseen. Worlds get another object at every reset. The hands are those of
-``preset="gentle"``; in the tables rough ones do not end an episode.
+Of the fifteen presets every third by name is unseen. Worlds get another object at every reset.
 
 Run: ``python -m benchmarks.objects_ppo [--time-limit 411] [--num-envs 4096] [--device cuda:0]``, or with
 ``--policy FILE`` for the table of a policy; on a CPU add ``--device cpu --num-envs 8 --episodes 2 --time-limit 30``,
@@ -9,7 +8,6 @@ which is too short to learn anything.
 """
 
 import argparse
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,11 +25,9 @@ from softmode.objects import PRESETS, ObjectSet
 
 SEEN, UNSEEN = ([name for k, name in enumerate(sorted(PRESETS)) if (k % 3 == 2) == last] for last in (False, True))
 OPTIONS: dict[str, Any] = {
-    "preset": "gentle",
     "config": {"objects": {"objects": SEEN, "resample": True}, "youngs_modulus_range": None},
 }
 """Environment of the training."""
-HANDS = LiftSoftConfig.preset("gentle")
 
 
 def table(policy: Policy, episodes: int, device: str) -> None:
@@ -39,7 +35,7 @@ def table(policy: Policy, episodes: int, device: str) -> None:
     print("| object | success | 95 % | safe success | peak force at the median [N] |\n|---|---|---|---|---|")
     for label, names in (("unseen", UNSEEN), ("seen", SEEN)):
         objects = ObjectSet(tuple(names), order="in_turn")
-        config = replace(HANDS, objects=objects, youngs_modulus_range=None, terminate_when_rough=False)
+        config = LiftSoftConfig(objects=objects, youngs_modulus_range=None)
         count = episodes * len(names)
         env: Any = gym.make_vec(policy.env, num_envs=count, config=config, device=device, autoreset_mode="Disabled")
         observation, _ = env.reset(seed=EVALUATION_SEED)
@@ -57,6 +53,7 @@ def main() -> None:
     """Train, unless a policy is given, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--policy", type=Path, help="file of a policy, in place of a training")
+    parser.add_argument("--init", type=Path, help="policy from which training starts")
     parser.add_argument("--time-limit", type=float, default=411.0, help="seconds of training")
     parser.add_argument("--num-envs", type=int, default=4096)
     parser.add_argument("--seed", type=int, default=0)
@@ -68,7 +65,8 @@ def main() -> None:
     path = given.policy
     if path is None:
         options = {"num_envs": given.num_envs, "device": given.device, "time_limit": given.time_limit}
-        options |= {"overrides": {"final_std": 0.1, "entropy_coefficient": 0.0005}, "seed": given.seed}
+        started = {"critic_warmup": 8, "initial_std": 0.3, "max_std": 0.6} if given.init else {}
+        options |= {"overrides": {"final_std": 0.1, **started}, "seed": given.seed, "init": given.init}
         options |= {"env_options": OPTIONS, "run_dir": given.run_dir, "eval_episodes": 0}
         result = train(TrainOptions(env="softmode/LiftSoft-v0", total_steps=10**10, **options))
         print(f"trained for {result.seconds:.0f} s, {result.env_steps:,} steps")

@@ -210,10 +210,37 @@ def normal_potential(
 ) -> np.ndarray:
     """Return the contact potential per unit stiffness: a dented penalty, one nine times as stiff from ``depth`` on.
 
-    Edges of a box are a penalty of their own stiffness, ``ridge_lead`` deeper in.
+    Edges of a box are a penalty of their own stiffness, ``ridge_lead`` deeper in, until the face presses as much; from
+    there on both together are as stiff as the face.
     """
-    faces = dented_penalty(penetration, eps, ratio) + 9.0 * penalty(penetration - depth, 2.0 * eps)
-    return faces + ridge * penalty(penetration + ridge_lead, eps)
+    left = 1.0 - ridge * (1.0 + ratio)
+    face = left * dented_penalty(penetration - ridge * (1.0 + ratio) / left * ridge_lead, eps, ratio)
+    edges = ridge * penalty(penetration + ridge_lead, eps)
+    return face + edges + 9.0 * penalty(penetration - depth, 2.0 * eps)
+
+
+def ridge_in_cell(
+    half: np.ndarray, x: np.ndarray, inward: np.ndarray, side: float, front: float
+) -> tuple[float, float]:
+    """Return the length of the edges of a box in a cell and how deep they are on the mean [m].
+
+    Edge by edge: where the cell's plane through the sample is cut by the line of the edge's place, how far that is
+    beside the sample and beyond the edge's end.
+    """
+    facing, away = np.maximum(np.where(x < 0.0, -inward, inward), 0.0), np.abs(x) - half
+    lengths, depths = [], []
+    for k in range(3):
+        slopes, gaps = np.delete(facing, k), np.delete(away, k)
+        reach = 0.85 * side / slopes.max() if slopes.max() > 0.0 else np.inf
+        steep = np.clip((slopes.min() / max(slopes.max(), 1e-12) - 0.3) / 0.7, 0.0, None)
+        if steep > 0.0:
+            beside = abs(slopes[1] * gaps[0] - slopes[0] * gaps[1]) / np.linalg.norm(slopes)
+            hat, end = max(1.0 - beside / reach, 0.0), np.clip(0.5 - 0.5 * away[k] / reach, 0.0, 1.0)
+            lengths.append(np.linalg.norm(slopes) ** 3 * steep * hat * end * side**2 / reach)
+            depths.append(-slopes @ gaps - facing[k] * max(away[k], 0.0))
+    total = sum(lengths)
+    depth = float(np.dot(lengths, depths)) / total if total else 0.0
+    return float(total * np.clip((front - 0.3) / 0.25, 0.0, 1.0)), depth
 
 
 def friction_potential(y: np.ndarray, eps: float) -> np.ndarray:
@@ -224,9 +251,9 @@ def friction_potential(y: np.ndarray, eps: float) -> np.ndarray:
 def stick_potential(y: np.ndarray, limit: float, stiffness: float, deep: float, depth: float) -> np.ndarray:
     """Return the energy [J] of a spring that slips at the force limit: the integral of min(force, limit).
 
-    The force is k y up to a tenth of the dent, and grows by ``deep`` from there on.
+    The force is k y up to 0.15 of the dent, and grows by ``deep`` from there on.
     """
-    bend = 0.1 * depth
+    bend = 0.15 * depth
     most = limit / stiffness if limit <= stiffness * bend else bend + (limit - stiffness * bend) / deep
     x = np.minimum(y, most)
     return 0.5 * stiffness * x**2 + 0.5 * (deep - stiffness) * np.maximum(x - bend, 0.0) ** 2 + limit * (y - x)

@@ -63,6 +63,8 @@ class _Asset:
     """Seed of what the build draws."""
     toy: Annotated[ObjectOptions, own_group()] = dataclasses.field(default_factory=ObjectOptions)
     """Your own object; what is left out is as the task, the policy's run or the file has it."""
+    finger: float | None = None
+    """Width of what is to press it [m]: a warning says how many surface samples that takes, if there are too few."""
 
     @property
     def path(self) -> Path:
@@ -249,7 +251,9 @@ def _examined(options: _Asset) -> tuple[SoftObject, BodyReport]:
     path = options.path
     toy = options.toy if options.file is None else dataclasses.replace(options.toy, object=path)
     if toy.splat is None and toy.preset is None and file_kind(path) == "body":
-        given = [f.name for f in dataclasses.fields(_Asset)[1:-1] if getattr(options, f.name) != f.default]  # file, toy
+        given = [
+            f.name for f in dataclasses.fields(_Asset)[1:-2] if getattr(options, f.name) != f.default
+        ]  # file, toy, finger
         given = [typed(name) for name in (*given, *toy.shape)]
         if given or isinstance(options, BodyBuild):
             raise ConfigError(
@@ -273,7 +277,8 @@ def _examined(options: _Asset) -> tuple[SoftObject, BodyReport]:
     made_of = {**stored_material(body), **toy.material}
     if made_of:
         body = dataclasses.replace(body, provenance={**body.provenance, "material": json.dumps(made_of)})
-    report = report_body(body, quadrature=quadrature, splats=splats.means, size=found.size_asked)
+    asked: dict[str, float | None] = {"size": found.size_asked, "finger": options.finger}
+    report = report_body(body, quadrature=quadrature, splats=splats.means, **asked)
     return dataclasses.replace(found, body=body, splats=splats), report
 
 

@@ -58,7 +58,8 @@ class Hyperparameters:
     features: int = 256
     """Features that the encoder of pixels ends with."""
     initial_std: float = 0.6
-    """Standard deviation of actions at the start, in units of half the action range."""
+    """Standard deviation of actions at the start, in units of half the action range; where training starts from a
+    checkpoint it is that one's, unless this is given."""
     min_std: float = 0.03
     """Lower bound of the standard deviation."""
     max_std: float = 1.0

@@ -86,6 +86,12 @@ class FlatAdam:
         self.value -= torch.where(finite, change, 0.0)
         return norm
 
+    def restart(self, learning_rate: float) -> None:
+        """Forget the gradients so far: a first one after many steps without any would lead several times too far."""
+        for moment in (self.first, self.second, self.steps):
+            moment.zero_()
+        self.learning_rate.fill_(learning_rate)
+
     def state(self) -> dict[str, torch.Tensor]:
         """Return what a checkpoint keeps."""
         return {name: getattr(self, name) for name in self.STATE}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import platform
 import sys
 import time
@@ -36,7 +37,7 @@ from softmode.learning.environments import make_vector_env
 from softmode.learning.nan_guard import NanGuard
 from softmode.learning.networks import Actor, ActorCritic
 from softmode.learning.policy import EVALUATION_SEED, SELECTION_SEED, Policy, actor_of, evaluate, film_episode
-from softmode.learning.ppo import PPO, STATE
+from softmode.learning.ppo import MIN_LEARNING_RATE, PPO, STATE
 from softmode.learning.rollout import Collector, Rollout
 from softmode.learning.run_folder import BEST, LATEST, RunFolder
 from softmode.learning.train_options import DEFAULT_STEPS, TrainOptions, TrainResult
@@ -217,6 +218,8 @@ class _Run:
                 fits = {k: v.shape for k, v in module.state_dict().items()} == {k: v.shape for k, v in arrays.items()}
                 if fits or name == "actor" or options.resume:  # else a critic of another kind, which starts anew
                     module.load_state_dict(arrays, strict=True)
+            if not options.resume and "initial_std" in options.overrides:
+                self.model.actor.log_std.data.fill_(math.log(self.hyperparameters.initial_std))
             if options.resume:
                 self.ppo.optimizer.load({k: torch.from_numpy(a) for k, a in start.part("optimizer").items()})
         except (RuntimeError, ValueError) as error:
@@ -346,7 +349,12 @@ class _Run:
         if self.iteration <= self.warm_until:
             losses = torch.zeros(len(PPO.LOSSES), device=self.device)
         else:
-            train_actor = self.iteration - self.warm_until > self.hyperparameters.critic_warmup or self.resumed > 0
+            after = self.iteration - self.warm_until - self.hyperparameters.critic_warmup
+            train_actor = after > 0 or self.resumed > 0
+            if after == 1 and self.options.init is not None:
+                # What an actor has learnt is lost in a few large steps; the schedule finds how large they may be.
+                adaptive = self.hyperparameters.schedule == "adaptive"
+                self.ppo.optimizer.restart(MIN_LEARNING_RATE if adaptive else self.hyperparameters.learning_rate)
             losses = self.ppo.update(rollout, self.generator, progress, train_actor)
         self.collector.update_moments(self.ppo.reward_moments, self.ranks)
         return losses

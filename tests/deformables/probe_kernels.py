@@ -3,6 +3,7 @@
 import warp as wp
 
 from softmode.deformables.contact import penalty_kernels as contact
+from softmode.deformables.contact import ridge_kernels
 from softmode.deformables.contact import shape_query_kernels as shape_queries
 from softmode.deformables.materials.hessian_kernels import HessianBlocks, hessian, stress_derivative
 from softmode.deformables.materials.material_cpu_kernels import LANES, energy_and_stress, hessian_lanes, mat98d, vec8d
@@ -120,6 +121,22 @@ def query_points(
         query = shape_queries.query_heightfield(x[i], fields, fields.index[0], reach)
     distance_out[i] = query.distance
     normal_out[i] = query.normal
+
+
+@wp.kernel
+def evaluate_ridges(
+    half: wp.array[wp.vec3d],
+    x: wp.array[wp.vec3d],
+    inward: wp.array[wp.vec3d],
+    side: wp.array[wp.float64],
+    front: wp.array[wp.float64],
+    # Out:
+    ridge_out: wp.array[wp.vec2d],
+):
+    """Evaluate length and depth of the edges of a box in cells."""
+    i = wp.tid()
+    length, depth = ridge_kernels.ridge_in_cell(half[i], x[i], inward[i], side[i], front[i])
+    ridge_out[i] = wp.vec2d(length, depth)
 
 
 @wp.kernel

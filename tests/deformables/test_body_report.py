@@ -26,7 +26,7 @@ from softmode.deformables.solver.step_tables import ONE_LAUNCH_BLOCKS
 from softmode.envs.tasks.place_in_bin import task as place_in_bin
 from softmode.envs.tasks.push_soft import task as push_soft
 from softmode.envs.tasks.shape_soft import config as shape_soft
-from softmode.errors import BasisError
+from softmode.errors import BasisError, ConfigError
 from softmode.objects import ObjectConfig, load, task_objects
 from softmode.objects.source import object_source
 from tests.bodies import RECIPES, changed, sheet, slab, small_box
@@ -105,6 +105,17 @@ def test_measures_of_a_box(body: ReducedBody, quadrature: Quadrature) -> None:
     assert report.measure("extent z") == pytest.approx(0.04, rel=1e-9)
     # The samples' hull misses the box's edges by half of their pitch.
     assert 1.0 < report.measure("volume over convex hull") < 1.1
+
+
+def test_fingers_too_narrow_for_the_samples_are_named(body: ReducedBody, quadrature: Quadrature) -> None:
+    """Three of S samples on an area A lie under a finger of sqrt(3 A / S); a narrower one needs 3 A / width^2."""
+    area, count = body.surface.areas.sum(), body.surface_count
+    width = np.sqrt(3.0 * area / count)
+    for finger, needed in ((1.01 * width, None), (0.5 * width, 4 * count)):
+        found = [f for f in report_body(body, quadrature=quadrature, finger=finger).findings if f.name == "samples"]
+        assert [f.remedy for f in found] == ([] if needed is None else [f"build it with --surface {needed}"])
+    with pytest.raises(ConfigError, match="finger"):
+        report_body(body, finger=0.0)
 
 
 def test_winding_numbers_tell_inside_from_outside(body: ReducedBody) -> None:

@@ -10,6 +10,8 @@ from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.contact.dents import CARRIED, mean_curvature, neighbourhoods, sample_room
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body
+from softmode.deformables.solver.options import SolverReducedOptions
+from tests import reference
 from tests.bodies import bar, cube, sheet, smooth_ball
 from tests.scenes import GRAVITY, Scene
 
@@ -18,12 +20,12 @@ NU = 0.3
 DOWN = (0.0, 0.0, -GRAVITY)
 
 
-def uniaxial(strain: float, modulus: float) -> float:
+def uniaxial(strain: float, modulus: float, ratio: float = NU) -> float:
     """Return the stress of the default material under a uniaxial strain, free across [Pa].
 
     P = m (1 - 1 / (I + 1)) F + l (J - a) cof F, m = 4/3 mu, l = lambda + 5/6 mu, a = 1 + 3 m / (4 l).
     """
-    mu, lam = modulus / (2.0 + 2.0 * NU), modulus * NU / ((1.0 + NU) * (1.0 - 2.0 * NU))
+    mu, lam = modulus / (2.0 + 2.0 * ratio), modulus * ratio / ((1.0 + ratio) * (1.0 - 2.0 * ratio))
     m, k = 4.0 / 3.0 * mu, lam + 5.0 / 6.0 * mu
 
     def stress(along: float, across: float) -> tuple[float, float]:
@@ -66,6 +68,39 @@ def test_whole_faces(body, strain: float) -> None:
     assert forces[-1] == pytest.approx(expected, rel=0.055 if body is sheet else 0.05)
     assert np.ptp(forces[-4:]) <= 1.0e-3 * expected
     assert np.abs(scene.state.softmode.dent.numpy()).max() <= 0.02 * strain * size[2]
+
+
+def test_pinched_sheet_keeps_what_touches() -> None:
+    """A sheet of 2 mm between a finger above and, below, another and the rim of a table: three shapes for two slots.
+
+    A sample keeps the two nearest. The third is on the other side of the sheet, which has samples of its own: all that
+    touches is kept, without a flag, and the upper finger presses as it does where one shape is below.
+    """
+    above = 0.01 + 0.9e-3
+    upper, pressed = (0.0, above, 0.02), []
+    for below in (((-0.05, -above, 0.05), (0.01, -above, 0.01)), ((-0.04, -above, 0.06),)):
+
+        def populate(world: newton.ModelBuilder, below: tuple[tuple[float, float, float], ...] = below) -> None:
+            material = Material(youngs_modulus=1.0e5, density=300.0, friction=0.0, mass_damping=100.0)
+            add_reduced_body(world, sheet(), material=material, scale=0.5)
+            for x, z, wide in (upper, *below):
+                pose = wp.transform(wp.vec3(x, 0.0, z), wp.quat_identity())
+                world.add_shape_box(-1, xform=pose, hx=wide, hy=0.01, hz=0.01)
+
+        scene = Scene(populate, [sheet()], dt=0.004, options=SolverReducedOptions(contact_margin=0.03))
+        scene.step(100)
+        view, near = scene.reduced.view, 0
+        assert scene.reduced.status.numpy()[0] == 0
+        x, shape = view.samples.position.numpy()[0], view.samples.shape.numpy()[0]
+        for k, (middle, z, wide) in enumerate((upper, *below)):
+            gap = reference.distance_box(x - [middle, 0.0, z], np.array([wide, 0.01, 0.01]))
+            assert (shape[gap < 0.0] == k).any(axis=1).all()
+            near = near + (gap < 0.8 * float(view.instances.margin.numpy()[0]))
+        assert np.max(near) == 1 + len(below)
+        count = int(view.constraints.count.numpy()[0])
+        upon = view.constraints.shape.numpy()[0, :count] == 0
+        pressed.append(-view.constraints.force.numpy()[0, :count][upon, 2].sum())
+    assert pressed[0] == pytest.approx(pressed[1], rel=0.02) and pressed[0] > 5.0
 
 
 @pytest.mark.parametrize("count", [2, pytest.param(3, marks=pytest.mark.rest)])

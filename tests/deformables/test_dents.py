@@ -121,11 +121,11 @@ class Press:
 def test_hertz(poissons_ratio: float) -> None:
     """A sphere between plates, as users get it, presses as Hertz's, made finite: within 7 % from 2 to 8 % of R.
 
-    At 1 % its patch has five samples.
+    Within 8 % at 1 %, where its patch lies in two cells.
     """
     press = Press(default_ball(poissons_ratio), RADIUS, poissons_ratio=poissons_ratio)
     for share in (0.01, 0.02, 0.04, 0.08):
-        depth, error = share * RADIUS, 0.15 if share == 0.01 else 0.07
+        depth, error = share * RADIUS, 0.08 if share == 0.01 else 0.07
         assert press.force(depth) == pytest.approx(hertz(depth, 1.0e6, poissons_ratio), rel=error), share
 
 
@@ -142,17 +142,18 @@ def test_follows_parameters() -> None:
     """The force goes with E as it is now, and at equal d / R with the square of the scale; to what float32 leaves.
 
     By E in the pose in which the ball has come to rest; with and without AVX-512 1.5e-6 was seen. A ball turns until it
-    lies on some of its samples: the small one finds another pose, whose force differs by 0.34 %.
+    lies on some of its samples: the small one begins in the pose of the large one, and both are damped, or it would
+    find another.
     """
     press, depth = Press(smooth_ball(), RADIUS), 0.04 * RADIUS
     force = settled(press, press.force(depth, 80))
-    rest = press.scene.q() + smooth_ball().linear_coordinates[:, :3]
     press.scene.set_parameter("youngs_modulus", 3.0e6)
     assert settled(press, press.held()) == pytest.approx(3.0 * force, rel=4.0e-6)
-    half = Press(smooth_ball(), RADIUS, scale=0.5)
+    whole, half = (Press(smooth_ball(), RADIUS, scale=scale, damping=1.0e4) for scale in (1.0, 0.5))
+    force, identity = settled(whole, whole.force(depth, 80)), smooth_ball().linear_coordinates[:, :3]
     half.start(0.5 * depth)
-    half.scene.set(q=0.5 * rest - smooth_ball().linear_coordinates[:, :3], qd=np.zeros_like(rest))
-    assert settled(half, half.held()) == pytest.approx(0.25 * force, rel=5.0e-3)
+    half.scene.set(q=0.5 * whole.scene.q() - 0.5 * identity, qd=np.zeros_like(identity))
+    assert settled(half, half.held()) == pytest.approx(0.25 * force, rel=1.0e-5)
 
 
 def test_two_spheres() -> None:

@@ -29,7 +29,7 @@ ShapeConfig = newton.ModelBuilder.ShapeConfig
 def test_stick_potential(depth):
     """A spring up to the limit, linear beyond; slope = secant * y; a continuous force, never above the limit.
 
-    Where the dent along the surface is used up, a tenth of ``depth``, the spring is five times as stiff.
+    Where the dent along the surface is used up, 0.15 of ``depth``, the spring is five times as stiff.
     """
     limit, stiffness, step = 0.3, 2.0e3, 1.0e-9
     spring = (stiffness, 5.0 * stiffness, depth)
@@ -47,7 +47,7 @@ def test_stick_potential(depth):
     slope = (evaluate(y + step)[:, 0] - evaluate(y - step)[:, 0]) / (2 * step)
     np.testing.assert_allclose(value[:, 1] * y, slope, atol=1e-5 * limit)
     assert (value[:, 1] * y).max() == pytest.approx(limit)
-    tangent = np.where(y <= 0.1 * depth, stiffness, 5.0 * stiffness)
+    tangent = np.where(y <= 0.15 * depth, stiffness, 5.0 * stiffness)
     np.testing.assert_array_equal(value[:, 2], np.where(value[:, 1] * y < (1.0 - 1e-12) * limit, tangent, 0.0))
     np.testing.assert_array_equal(evaluate(np.array([0.0, step]), limit=0.0), 0.0)
 

@@ -215,6 +215,8 @@ def test_files_and_refusals(make_env: MakeEnv, tmp_path: Path) -> None:
     arm = replace(scene.arm, home_position=(0.42, 0.0, 0.17))
     newer = archive_bytes({"format": "softmode-env-state", "version": 2}, {})
     short = EnvState(owner=state.owner, arrays={**state.arrays, "state.joint_q": np.zeros((1, 2))}, random=(None,))
+    undented = EnvState(owner=state.owner, arrays=dict(state.arrays), random=(None,))
+    undented.arrays.pop("state.softmode.dent")
     for bad, message in (
         (other.get_state(), "task is LiftSoft"),
         (make("PushSoft", config=replace(config, scene=replace(scene, object=wide))).get_state(), "objects"),
@@ -223,6 +225,7 @@ def test_files_and_refusals(make_env: MakeEnv, tmp_path: Path) -> None:
             "robot",
         ),
         (short, "state.joint_q is of 2 numbers"),
+        (undented, "state.softmode.dent is absent in the state"),
         (newer, "version 2"),
         (state.to_bytes()[:200], "damaged"),
         ("state.npz", "state is a str"),

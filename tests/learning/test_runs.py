@@ -192,12 +192,14 @@ def test_resumption_is_refused_where_it_cannot_work(tmp_path: Path):
 
 
 def test_init_starts_from_a_policy(tmp_path: Path):
-    """The actor is the given one while the critic alone warms up; a policy of other spaces is refused."""
+    """The actor is the given one while the critic warms up, with the noise asked for; other spaces are refused."""
     first = run(tmp_path / "first", 640)
     options = Hyperparameters(**{**SMALL.to_json(), "hidden": (16,), "critic_warmup": 100})
-    second = run(tmp_path / "second", 320, init=first.run_dir / "latest.npz", hyperparameters=options)
+    more = {"hyperparameters": options, "overrides": {"initial_std": 0.3}}
+    second = run(tmp_path / "second", 320, init=first.run_dir / "latest.npz", **more)
     old, new = (read_checkpoint(r.run_dir / "latest.npz").arrays for r in (first, second))
     assert np.array_equal(old["actor.mean.0.weight"], new["actor.mean.0.weight"])
+    np.testing.assert_allclose(np.exp(new["actor.log_std"]), 0.3, rtol=1e-6)
     assert not np.array_equal(old["critic.value.0.weight"], new["critic.value.0.weight"])
     with pytest.raises(CheckpointError, match="Point"):
         run(tmp_path / "third", 64, env="Other", init=first.run_dir / "latest.npz")
@@ -205,6 +207,16 @@ def test_init_starts_from_a_policy(tmp_path: Path):
     with pytest.raises(CheckpointError, match="other networks"):
         run(tmp_path / "fourth", 64, init=first.run_dir / "latest.npz", hyperparameters=wide)
     assert not (tmp_path / "fourth").exists()
+
+
+def test_what_an_actor_has_learnt_survives_its_first_update(tmp_path: Path):
+    """However long the critic warmed up, and though the noise is small, it moves by no more than the schedule wants."""
+    narrow = {**SMALL.to_json(), "hidden": (256,), "max_std": 0.03, "initial_std": 0.03}
+    first = run(tmp_path / "first", 640, hyperparameters=Hyperparameters(**narrow))
+    options = Hyperparameters(**{**narrow, "critic_warmup": 30})
+    run(tmp_path / "second", 64 * 34, init=first.run_dir / "latest.npz", hyperparameters=options)
+    moved = [float(row["divergence"]) for row in rows(tmp_path / "second")]
+    assert max(moved[:31]) < 1e-6 < max(moved[31:]) < 4.0 * options.desired_kl, moved
 
 
 @pytest.mark.parametrize("reward_nan", [False, True])

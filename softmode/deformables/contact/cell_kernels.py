@@ -10,7 +10,7 @@ n of what is touched, the rest normal N and F of the body a step's velocity ahea
                                                 of the penalty, a: ``steepest``
     b = A (H + H_other) / (2 pi)                range by the mean curvatures of both: exact for a sphere
     e = sqrt(e_0^2 + t^2 + b^2)                 e_0: ``contact_smoothing``
-    q = e/2 - gap - b/2 - 0.15 e_0              penetration, a step's velocity ahead
+    q = e/2 - gap - b/2 - l e_0 (e_0/e)^2       penetration, a step's velocity ahead
     T = -min(L/2 - q L/(3 t), L t/(6 q)) m/|m|  centre of pressure from the sample, at rest, in the onset;
                                                 -L t/(12 (q - e/2)) m/|m| beyond
 
@@ -33,9 +33,8 @@ FADE = wp.constant(1.0e-3)
 long against a dent, or a face that rides in its onset is soft and stiff in turns."""
 FACING = wp.constant(wp.float64(0.2))
 """Cosine below which a cell belongs to a face around an edge, whose tilt says nothing of the gaps."""
-LATE = wp.constant(wp.float64(0.15))
-"""Share of e_0 by which a contact begins later than half its range outside: a face that rides in its onset then stands,
-from 1 to 10 % of strain, within 1 % of where it should."""
+LATE = wp.constant(wp.float64(0.406))
+"""How deep a level face lies in its onset when it is squeezed by 1 %, in e_0 at nu 0, see ``late_of``."""
 NEAR = wp.constant(wp.float64(0.5))
 """Share of that bound, as a gap, beyond which a cell is level and nothing around it counts, as it cannot touch but by
 an impact: what flies past a shape must not feel that it might lean against it."""
@@ -79,6 +78,20 @@ class CellShape:
     least: wp.float64  # e_0 [m]
     steepest: wp.float64  # range by tilt beyond which a cell counts as level again: most of the margin [m]
     fade: wp.float64  # that of a level and flat cell [m]
+    poissons_ratio: wp.float64
+
+
+@wp.func
+def late_of(poissons_ratio: wp.float64):
+    """Return l, the share of e_0 by which a level contact begins later than half its range outside.
+
+    A face that is squeezed by 1 % then stands where it should, and within 1 % of that from there to 10 %. It rides in
+    its onset, sqrt(2 P e_0 / kappa) deep, and kappa goes with the constrained modulus. A cell that leans or bends has
+    less of it, by the square of e_0 / e: a ball is pressed by its springs.
+    """
+    one = wp.float64(1.0)
+    softer = (one + poissons_ratio) * (one - wp.float64(2.0) * poissons_ratio) / (one - poissons_ratio)
+    return wp.float64(0.5) - LATE * wp.sqrt(softer)
 
 
 @wp.func
@@ -94,6 +107,7 @@ def shape_of_cell(surface: Surface, instances: Instances, basis: Basis, i: int, 
     shape.least = wp.float64(instances.smoothing[i] / surface.slenderness[row])
     shape.steepest = wp.float64(0.7 * instances.margin[i] / surface.slenderness[row])
     shape.fade = wp.float64(FADE * instances.size[i])
+    shape.poissons_ratio = wp.float64(instances.poissons_ratio[i])
     return shape
 
 
@@ -133,7 +147,8 @@ def cell_at(shape: CellShape, F: wp.mat33d, n: wp.vec3d, gap: wp.float64, closin
     tilt = wp.length(lean)
     cell = Cell()
     cell.onset = wp.sqrt(shape.least * shape.least + shape.bend * shape.bend + tilt * tilt)
-    cell.lead = half * (cell.onset - shape.bend) - LATE * shape.least
+    level = shape.least / cell.onset
+    cell.lead = half * (cell.onset - shape.bend) - late_of(shape.poissons_ratio) * level * level * shape.least
     if tilt > LEVEL * shape.least:
         q = cell.lead - gap - closing
         at = half * shape.width

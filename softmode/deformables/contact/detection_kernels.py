@@ -30,7 +30,7 @@ from softmode.deformables.contact.penalty_kernels import (
     shear_yield,
     stiffness_per_area,
 )
-from softmode.deformables.contact.ridge_kernels import REACH, RIDGE, face_beside_edge, ridge_in_cell
+from softmode.deformables.contact.ridge_kernels import NARROW, REACH, RIDGE, beside_edge, ridge_in_cell
 from softmode.deformables.contact.shape_query_kernels import (
     BOX,
     CAPSULE,
@@ -309,6 +309,7 @@ def ridge_of(
     row: int,
     shape: int,
     gap: float,
+    normal: wp.vec3d,
 ):
     """Return length and depth of the edges of a box in a cell [m], and the normal of the cell into the body."""
     origin, rotation = shape_frame(shapes, shape)
@@ -319,11 +320,12 @@ def ridge_of(
     length = wp.float64(0.0)
     depth = wp.float64(0.0)
     inward = wp.vec3d()
-    axis = face_beside_edge(half, x, gap, side)
-    if axis >= 0:
+    if beside_edge(half, x, gap, side):
         F = gradient_of(instances, basis, motion.q_start, i, row)
         inward = -wp.normalize(wp.transpose(wp.inverse(F)) * wp.vec3d(basis.row_normal[row]))
-        length, depth = ridge_in_cell(half, x, wp.quat_rotate_inv(rotation, inward), wp.float64(side), axis)
+        length, depth = ridge_in_cell(
+            half, x, wp.quat_rotate_inv(rotation, inward), wp.float64(side), wp.dot(normal, inward)
+        )
     return length, depth, inward
 
 
@@ -400,6 +402,10 @@ def find_contacts(
                 along = inner / depth
                 end = 2.0 * depth
                 back = 1
+            elif kind == BOX and query.distance <= 0.0 and wp.dot(query.normal, inner) < OPPOSED * depth:
+                along = inner / depth
+                end = 0.3 * OVERLAP * instances.size[i]
+                back = 1
         if end == 0.0 and query.distance > 0.0 and travel > instances.margin[i] and travel > query.distance:
             # a half-space at the start would also stop fast samples that fly past a small shape
             along = wp.quat_rotate_inv(turn, drift) / travel
@@ -407,8 +413,11 @@ def find_contacts(
         if end > 0.0:
             query = march(shapes, shape, local, query, along, end, back, thick, instances.smoothing[i], far)
         if kind == BOX and query.distance >= reach and query.distance < REACH * side:
-            length, _deep, _in = ridge_of(instances, basis, motion, shapes, samples, i, row, shape, query.distance)
-            if length > wp.float64(0.0):
+            facing = wp.vec3d(wp.quat_rotate(turn, query.normal))
+            length, deep, _in = ridge_of(
+                instances, basis, motion, shapes, samples, i, row, shape, query.distance, facing
+            )
+            if length > wp.float64(0.0) and deep > -wp.float64(reach):
                 reach = REACH * side
         gap = wp.float64(query.distance)
         if gap < wp.float64(reach) and gap < samples.gap[i, s, 1]:
@@ -626,12 +635,12 @@ def gather_contacts(
         start = wp.mat33d()
         ahead = wp.mat33d()
         closing = wp.float64(0.0)
-        spared = float(1.0)
+        touched = wp.float64(0.0)
         if gap <= NEAR * cell_shape.steepest:
             start, ahead, closing = motion_of_cell(instances, basis, motion, shapes, samples, i, row, shape, normal, dt)
             fade = fade_of(cell_shape, ahead, normal)
             touched = touched_share(surface, samples.shape, samples.gap, cell_shape, fade, i, row, shape)
-            spared = float(wp.float64(1.0) - touched * touched)
+        spared = float(wp.float64(1.0) - touched * touched)
         area = wp.max(sample_area(instances.scale[i], basis.row_area[row]), 1.0e-30)
         relative = surface.relative_stiffness[row]
         partner_mass = float(0.0)
@@ -654,16 +663,17 @@ def gather_contacts(
         ridge_lead = wp.float64(0.0)
         if shapes.kind[shape] == BOX:
             found = float(samples.gap[i, s, slot])
-            length, deep, inward = ridge_of(instances, basis, motion, shapes, samples, i, row, shape, found)
-            if length > wp.float64(0.0) and dent > 0.0:
-                modulus = wp.float64(instances.scale[i] * surface.dent_length[row] / dent)
-                ridge = RIDGE * modulus * length / stiffness
-                face = cell.lead - gap
-                edge = wp.float64(0.5) * cell.onset + deep
+            length, deep, inward = ridge_of(instances, basis, motion, shapes, samples, i, row, shape, found, normal)
+            face = cell.lead - gap
+            edge = wp.float64(0.5) * cell.onset + deep
+            if length > wp.float64(0.0) and dent > 0.0 and edge > face:
+                scale = wp.float64(instances.scale[i] * surface.dent_length[row])
+                narrow = wp.pow(wp.max(edge, wp.float64(0.0)) / scale, NARROW)
+                ridge = RIDGE * narrow * scale / wp.float64(dent) * length / stiffness
                 least = wp.min(wp.max(face, edge), wp.float64(0.0)) - cell_shape.least
                 push = wp.max(face - least, wp.float64(0.1) * cell_shape.least)  # of the face too where it is far
                 push /= wp.float64(1.0) + stiffness * compliance
-                normal = wp.normalize(push * normal + ridge * wp.max(edge - least, wp.float64(0.0)) * inward)
+                normal = wp.normalize(push * normal + ridge * (edge - wp.max(face, least)) * inward)
                 ridge_lead = edge - face
         constraints.ridge[i, e] = ridge
         constraints.ridge_lead[i, e] = ridge_lead  # always: nan from a step before would be felt, as 0 times it is nan
@@ -703,7 +713,7 @@ def gather_contacts(
         constraints.anchor[i, e] = anchor
         stick = stick_ratio * wp.float64(shear * area)
         constraints.stick_deep[i, e] = stick
-        constraints.stick[i, e] = stick / (wp.float64(1.0) + stick * shear_yield(instances, i, compliance))
+        constraints.stick[i, e] = stick / (wp.float64(1.0) + stick * shear_yield(instances, i, compliance, touched))
         constraints.stiffness[i, e] = stiffness
         constraints.dent_compliance[i, e] = compliance
         depth = dent_depth(instances, i, surface.dent_length[row], edged)

@@ -595,8 +595,10 @@ def write_pairs(
     F_own = gradient_of(instances, basis, motion.q_start, i, own)
     fade = fade_of(mine, F_own, n)
     theirs = shape_of_cell(surface, instances, basis, j, at, surface.curvature[own] / instances.scale[i])
-    spared_i = float(wp.float64(1.0) - touched_share(surface, pairs.other, pairs.gap, mine, fade, i, own, j))
-    spared_j = float(wp.float64(1.0) - touched_share(surface, pairs.other, pairs.gap, theirs, fade, j, at, i))
+    touched_i = touched_share(surface, pairs.other, pairs.gap, mine, fade, i, own, j)
+    touched_j = touched_share(surface, pairs.other, pairs.gap, theirs, fade, j, at, i)
+    spared_i = float(wp.float64(1.0) - touched_i)
+    spared_j = float(wp.float64(1.0) - touched_j)
     wi = wp.float64(spared_i * dent_compliance(instances, i, ri, surface.dent_length[own]) / half_area)
     wj = wp.float64(spared_j * dent_compliance(instances, j, rj, surface.dent_length[at]) / half_area)
     compliance = beyond_penalty(stiffness, wi + wj)
@@ -604,8 +606,8 @@ def write_pairs(
     stick = stick_ratio * shear
     deep = stick
     part = wi / wp.max(wi + wj, wp.float64(1.0e-30))
-    along = part * shear_yield(instances, i, compliance)
-    along += (wp.float64(1.0) - part) * shear_yield(instances, j, compliance)
+    along = part * shear_yield(instances, i, compliance, touched_i)
+    along += (wp.float64(1.0) - part) * shear_yield(instances, j, compliance, touched_j)
     stick = stick / (wp.float64(1.0) + stick * along)
     pairs.share[i, s, slot] = float(part)
     thick = wp.max(instances.scale[i] * pairs.thickness[own], instances.scale[j] * pairs.thickness[at])

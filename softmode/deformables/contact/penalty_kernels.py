@@ -46,9 +46,12 @@ HARDENING = wp.constant(wp.float64(9.0))
 sinks in 1.4 to 2.4 mm instead of 7 to 8. Ten times the stiffness throughout costs light bodies momentum."""
 HARDENING_DEPTH = wp.constant(wp.float64(2.0))
 """Penetration beyond which it does besides the dent, in ranges of the onset of a level face."""
-ALONG = wp.constant(wp.float64(0.1))
-"""Largest dent along the surface over that across it. What rolls needs 0.05 mm of it. Without a bound a soft body that
-fingers pinch at few samples gets out from between them: contact there hardens across, and must along."""
+ALONG = wp.constant(wp.float64(0.15))
+"""Largest dent along the surface over that across it. What rolls needs 0.05 mm of it, what turns under a finger 0.3 mm.
+Without a bound a soft body that fingers pinch at few samples gets out from between them: contact there hardens across,
+and must along."""
+LEAST_ALONG, GROWTH = wp.constant(wp.float64(0.5)), wp.constant(wp.float64(3.0))
+"""Dent along the surface over Mindlin's where nothing around is touched, and how much more per share c."""
 HARDENING_RANGE = wp.constant(wp.float64(2.0))
 """Range of the onset of what it gains, in ranges of the contact's onset."""
 
@@ -65,6 +68,17 @@ def penalty(penetration: wp.float64, eps: wp.float64):
 
 
 @wp.func
+def beside_ridge(ratio: wp.float64, ridge: wp.float64, ridge_lead: wp.float64):
+    """Return what a face adds to the edges in its cell, over the penalty, and how much deeper [m]: the larger counts.
+
+    Beyond the depth at which both press alike, they are as stiff as the face.
+    """
+    share = wp.float64(1.0) / (wp.float64(1.0) + ratio) - ridge
+    share = wp.max(share, wp.float64(1.0e-9))
+    return share, ridge * ridge_lead / share
+
+
+@wp.func
 def normal_potential(
     penetration: wp.float64,
     eps: wp.float64,
@@ -76,7 +90,8 @@ def normal_potential(
     """Return the contact potential of a penetration [m] per unit stiffness, and its first two derivatives.
 
     The C2 penalty of springs in series with the dent, 1 / (1 + ratio) as stiff, and a stiffer penalty that sets in
-    twice as deep and as slowly, ``depth`` deeper where there is a dent; and that of the edges in the cell.
+    twice as deep and as slowly, ``depth`` deeper where there is a dent. Of a face and of the edges in its cell the one
+    counts that presses more, so that how many samples an edge happens to lie on says little.
 
     Args:
         penetration: p [m].
@@ -84,10 +99,10 @@ def normal_potential(
         ratio: Compliance of the dent over that of the penalty; 0 for none.
         depth: Dent [m] from which on the stiffer penalty carries.
         ridge: Stiffness of edges, see ``ridge_kernels``.
-        ridge_lead: How much deeper they are in [m].
+        ridge_lead: How much deeper they are in, at least 0 [m].
     """
-    share = wp.float64(1.0) / (wp.float64(1.0) + ratio)
-    psi, slope, curvature = penalty(penetration, eps)
+    share, after = beside_ridge(ratio, ridge, ridge_lead)
+    psi, slope, curvature = penalty(penetration - after, eps)
     psi_deep, slope_deep, curvature_deep = penalty(penetration - depth, HARDENING_RANGE * eps)
     psi_edge, slope_edge, curvature_edge = penalty(penetration + ridge_lead, eps)
     return (
@@ -250,11 +265,21 @@ def dent_depth(instances: Instances, i: int, length: float, edged: bool):
 
 
 @wp.func
-def shear_yield(instances: Instances, i: int, compliance: wp.float64):
-    """Return the compliance along the surface [m/N] of a dent of some compliance across it: Mindlin's ratio."""
+def shear_growth(touched: wp.float64):
+    """Return how much softer a dent is along the surface the wider its patch, and the derivative by that share c.
+
+    What turns on a patch of radius a is as stiff as a^3, a bed of springs as a^4.
+    """
+    return LEAST_ALONG + GROWTH * touched, GROWTH
+
+
+@wp.func
+def shear_yield(instances: Instances, i: int, compliance: wp.float64, touched: wp.float64):
+    """Return the compliance along the surface [m/N] of a dent: Mindlin's ratio to that across, less where narrow."""
     nu = wp.float64(instances.poissons_ratio[i])
     two = wp.float64(2.0)
-    return compliance * (two - nu) / (two - two * nu)
+    growth, _by_touched = shear_growth(touched)
+    return growth * compliance * (two - nu) / (two - two * nu)
 
 
 @wp.func

@@ -2,58 +2,63 @@
 
 A half-space stands for a shape in a contact, with a dent of the scale that the functions of a body leave out. An edge
 presses a strip much narrower than that. On a half plane such a strip gives by the logarithm of its width: its force per
-length is nearly a constant times E / (1 - nu^2) and its depth. This is a spring besides the one of the faces. With the
-inward normal m of the cell, c_i = n_i . m of the faces of the box and a_i the distances of the sample to them, the edge
-between faces i and j lies
+length is E / (1 - nu^2) times its depth and a number that hardly grows with it, here as (depth / dent)^0.15. Of this
+spring and the one of the face that counts which presses more: faces meet samples that lie under them by chance, edges
+all around. With the inward normal m of the cell, c_i = n_i . m of the faces of the box and a_i the distances of the
+sample to them, the edge between faces i and j lies
 
     delta = -(c_i a_i + c_j a_j)                     deep below the cell, and
     xi = |c_j a_i - c_i a_j| / |(c_i, c_j)|          beside the sample.
 
-Of each edge a cell of area A has the length A / r (1 - xi / r), r the reach: over all cells the edge's own.
+Of each edge a cell of area A has the length A / r (1 - xi / r), r the reach: over all cells the edge's own. It counts
+by the cube of the cosine of its slope below the cell, one for along its length, two for the force, as finite elements
+say of corners.
 """
 
 import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
-REACH = wp.constant(0.7)
+REACH = wp.constant(0.85)
 """Distance to a box over the side of a cell up to which an edge may lie in the cell."""
-RIDGE = wp.constant(wp.float64(0.22))
-"""Force per length of an edge of 90 degrees over E / (1 - nu^2) and depth, less what its faces press."""
+RIDGE, NARROW = wp.constant(wp.float64(0.365)), wp.constant(wp.float64(0.15))
+"""Force per length of an edge of 90 degrees over E / (1 - nu^2) and depth, as deep as the dent under that pressure; the
+power of the depth with which it grows: 0.26 at 1 % of the size of the default cube, 0.34 at 5 %."""
 
 STEEP = wp.constant(wp.float64(0.3))
 """Slope of the flatter of two faces over that of the steeper one, up to which their edge is the rim of a flat punch and
 presses nothing of its own."""
 FLANK, FRONT = wp.constant(wp.float64(0.3)), wp.constant(wp.float64(0.55))
-"""Cosines between the normals of the nearest face and of the cell: up to the first the face is a flank beside the cell,
-whose edge counts nothing, since the plane of the cell goes on where the cell ends; from the second on it counts."""
+"""Cosines between the normals of what is nearest and of the cell: up to the first that is a flank beside the cell whose
+edge counts nothing, since the plane of the cell goes on where the cell ends; from the second on it counts."""
 
 
 @wp.func
-def face_beside_edge(half: wp.vec3d, x: wp.vec3d, gap: float, side: float):
-    """Return the axis of the face of a box that is nearest to a sample with an edge near it, else -1.
+def beside_edge(half: wp.vec3d, x: wp.vec3d, gap: float, side: float):
+    """Return whether a sample with a gap [m] has an edge of a box near it.
 
-    None where the sample is outside of two faces, which no cell reaches with their edge, or the gap is of a way
-    through the box: the contact then has another normal.
+    Not beyond a corner, where no cell reaches an edge, nor if the gap is of a way through the box: the contact then has
+    another normal.
     """
-    axis = int(0)
-    count = int(0)
+    near = int(0)
     outside = int(0)
+    deepest = wp.float64(-1.0e30)
+    out = wp.vec3d()
     for k in range(3):
         away = wp.abs(x[k]) - half[k]
         if away > wp.float64(-2.0 * REACH * side):
-            count += 1
+            near += 1
         if away > wp.float64(0.0):
             outside += 1
-        if away > wp.abs(x[axis]) - half[axis]:
-            axis = k
-    nearest = float(wp.abs(x[axis]) - half[axis])
+            out[k] = away
+        deepest = wp.max(deepest, away)
+    distance = float(wp.where(outside > 0, wp.length(out), deepest))
     rounding = 2.0e-6 * wp.max(1.0, float(wp.max(half)))  # of distances in float32
-    return wp.where(count > 1 and outside < 2 and wp.abs(nearest - gap) < rounding, axis, -1)
+    return near > 1 and outside < 3 and wp.abs(distance - gap) < rounding
 
 
 @wp.func
-def ridge_in_cell(half: wp.vec3d, x: wp.vec3d, inward: wp.vec3d, side: wp.float64, axis: int):
+def ridge_in_cell(half: wp.vec3d, x: wp.vec3d, inward: wp.vec3d, side: wp.float64, front: wp.float64):
     """Return the length of edges in a cell [m], as if they were steep on both sides, and how deep they are in [m].
 
     Args:
@@ -61,7 +66,7 @@ def ridge_in_cell(half: wp.vec3d, x: wp.vec3d, inward: wp.vec3d, side: wp.float6
         x: The sample in its frame [m].
         inward: Normal of the cell there, into the body.
         side: Of the cell [m].
-        axis: That of the nearest face.
+        front: Cosine between the normals of the contact and of the cell.
     """
     zero = wp.float64(0.0)
     one = wp.float64(1.0)
@@ -84,9 +89,9 @@ def ridge_in_cell(half: wp.vec3d, x: wp.vec3d, inward: wp.vec3d, side: wp.float6
             beside = wp.abs(facing[j] * away[i] - facing[i] * away[j]) / wp.sqrt(both)
             near = wp.max(one - beside / reach, zero)
             end = wp.clamp(one / two - away[k] / (two * reach), zero, one)
-            part = both * (sharp - STEEP) / (one - STEEP) * near * end * side * side / reach
+            part = wp.sqrt(both) * both * (sharp - STEEP) / (one - STEEP) * near * end * side * side / reach
             length += part
             over = facing[k] * wp.max(away[k], zero)
             moment -= part * (facing[i] * away[i] + facing[j] * away[j] + over)
     depth = moment / wp.max(length, wp.float64(1.0e-30))
-    return length * wp.clamp((facing[axis] - FLANK) / (FRONT - FLANK), zero, one), depth
+    return length * wp.clamp((front - FLANK) / (FRONT - FLANK), zero, one), depth

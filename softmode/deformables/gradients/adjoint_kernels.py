@@ -12,6 +12,7 @@ from softmode.deformables.contact.penalty_kernels import (
     ALONG,
     BULK_FACTOR,
     SHEAR_FACTOR,
+    beside_ridge,
     beyond_exponent,
     contact_potential,
     dent_exponents,
@@ -19,10 +20,10 @@ from softmode.deformables.contact.penalty_kernels import (
     friction_potential,
     penalty,
     shear_exponents,
-    shear_yield,
     slip_potential,
     stiffness_exponents,
 )
+from softmode.deformables.contact.ridge_kernels import NARROW
 from softmode.deformables.materials.hessian_kernels import stress_derivative
 from softmode.deformables.materials.material_kernels import green_strain, hooke_stress, stress
 from softmode.deformables.model.declare import struct
@@ -59,7 +60,8 @@ class Linearised:
     memory: wp.array2d[wp.vec3d]  # what the next step feels of a contact's memory, over the stick stiffness
     memory_start: wp.array2d[wp.vec3d]  # the loss by the memory that a step begins with, shape's frame [1/m]
     contact_bar: wp.array2d[wp.vec3d]  # the loss by a contact's displacement [1/m], and
-    normal_bar: wp.array2d[wp.vec3d]  # by its normal force, by ln of its dent's compliance and of its depth besides
+    normal_bar: wp.array2d[wp.vec4d]  # by its normal force, by ln of its dent's compliance and of its depth besides,
+    # and of what the dent along the surface is beside that across
     cell_gradient: wp.array2d[wp.mat33d]  # the loss by the gradient of a cell ahead, and
     cell_place: wp.array2d[wp.vec3d]  # by the sample's place ahead [1/m]
     cell_spared: wp.array2d[wp.float64]  # by the share of the neighbourhood that does not touch
@@ -212,7 +214,8 @@ def place_constraints(
     p = -wp.dot(n, x)
     ratio = k * constraints.dent_compliance[i, e]
     _psi, slope, curvature = contact_potential(constraints, p, i, e)
-    _penalty, plain_slope, _curvature = penalty(p, constraints.onset[i, e])
+    _share, after = beside_ridge(ratio, constraints.ridge[i, e], constraints.ridge_lead[i, e])
+    _penalty, plain_slope, plain_curvature = penalty(p - after, constraints.onset[i, e])
     t = x + p * n
     y = wp.length(t)
     c = constraints.friction[i, e]
@@ -231,9 +234,11 @@ def place_constraints(
         slip += (tangent - secant) / (y * y) * wp.outer(t, t)
     step.constraint_slip[i, e] = k * slope * by_limit * t
     step.constraint_normal[i, e] = n - c * by_limit * t
-    by_ratio = -ratio / ((wp.float64(1.0) + ratio) * (wp.float64(1.0) + ratio)) * plain_slope
+    by_ratio = -ratio / ((wp.float64(1.0) + ratio) * (wp.float64(1.0) + ratio))
+    by_ratio *= plain_slope + after * plain_curvature
     _edge, edge_slope, _curvature = penalty(p + constraints.ridge_lead[i, e], constraints.onset[i, e])
-    by_edge = constraints.ridge[i, e] * edge_slope
+    by_edge = edge_slope - plain_slope - (constraints.ridge_lead[i, e] + after) * plain_curvature
+    by_edge *= constraints.ridge[i, e]
     step.constraint_gain[i, e] = k * wp.vec3d(slope - by_edge + by_ratio, by_ratio, by_edge)
     step.constraint_hessian[i, e] = k * curvature * N + slip - c * k * curvature * by_limit * wp.outer(t, n)
 
@@ -541,17 +546,18 @@ def accumulate_constraints(
     steep = beyond_exponent(constraints.stiffness[i, e] * constraints.dent_compliance[i, e])
     dent_powers = steep * dent_exponents(instances, i) + (steep - wp.float64(1.0)) * stiffness_powers
     by = step.constraint_gain[i, e]
-    normal_gain = by[0] * stiffness_powers + by[1] * dent_powers - by[2] * dent_exponents(instances, i)
+    edge_powers = -dent_exponents(instances, i) - wp.vec4d(none, none, none, NARROW)
+    normal_gain = by[0] * stiffness_powers + by[1] * dent_powers + by[2] * edge_powers
     # k_t is that of the spring of friction and of the dent along the surface in series
-    yields = constraints.stick[i, e] * shear_yield(instances, i, constraints.dent_compliance[i, e])
+    stick = constraints.stick[i, e]
+    deep = constraints.stick_deep[i, e]
+    yields = wp.where(stick > none, wp.float64(1.0) - stick / deep, none)
     deep_powers = stiffness_exponents(instances, i, SHEAR_FACTOR, relative, partner_area, dt)
     shear_powers = deep_powers - yields * (deep_powers + dent_powers + shear_exponents(instances, i))
     # what a contact remembers is its elastic slip under the tangential force; that of one that sticks is by its slip
     force = constraints.force[i, e]
     along = force - wp.dot(constraints.normal[i, e], force) * constraints.normal[i, e]
     limit = constraints.friction[i, e] * wp.length(force - along)
-    stick = constraints.stick[i, e]
-    deep = constraints.stick_deep[i, e]
     depth = constraints.dent_depth[i, e]
     felt = step.memory[i, e]
     L -= step.memory[i, e]
@@ -568,7 +574,7 @@ def accumulate_constraints(
         by_shear *= share
         by_depth = (wp.float64(1.0) - deep / stick) * by_shear
     sums.contact[i, e] = sums.contact[i, e] + by_normal * normal_gain + by_shear * shear_powers + by_deep * deep_powers
-    step.normal_bar[i, e] = wp.vec3d(by_normal, by_normal * by[1] - by_shear * yields, by_depth)
+    step.normal_bar[i, e] = wp.vec4d(by_normal, by_normal * by[1] - by_shear * yields, by_depth, -by_shear * yields)
     # of x = gap n + slip - drift + d, the gap grows along n as the sample's place at the start does, d falls by as much
     # as that, and the drift of a shape that turns by R within the step grows by R - I of it
     n = constraints.normal[i, e]
@@ -578,6 +584,9 @@ def accumulate_constraints(
     _origin, rotation = shape_frame(shapes, shape)
     step.memory_start[i, e] = -wp.quat_rotate_inv(rotation, across)
     across += turned_back(shapes, shape, back, dt)
+    if constraints.ridge[i, e] > none:  # how stiff an edge is follows how deep it is at the start
+        edge = constraints.ridge_lead[i, e] - wp.dot(n, constraints.offset[i, e])
+        across -= by_normal * by[2] * NARROW / wp.max(edge, wp.float64(1.0e-9)) * n
     step.constraint[i, e] = across
     # c = sqrt(friction of body * friction of shape)
     if instances.friction[i] > 0.0:

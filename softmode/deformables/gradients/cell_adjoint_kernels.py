@@ -30,9 +30,11 @@ from softmode.deformables.contact.penalty_kernels import (
     HARDENING,
     HARDENING_DEPTH,
     HARDENING_RANGE,
+    beside_ridge,
     beyond_exponent,
     dent_exponents,
     penalty,
+    shear_growth,
     stiffness_exponents,
 )
 from softmode.deformables.gradients.adjoint_kernels import Linearised, Sums, turned_back
@@ -145,12 +147,17 @@ def accumulate_cells(
     deep = HARDENING_RANGE * eps
     ratio = k * constraints.dent_compliance[i, e]
     share = wp.float64(1.0) / (wp.float64(1.0) + ratio)
-    _psi, _slope, curvature = penalty(p, eps)
+    ridge = constraints.ridge[i, e]
+    beside, after = beside_ridge(ratio, ridge, constraints.ridge_lead[i, e])
+    _psi, _slope, curvature = penalty(p - after, eps)
     _deep_psi, _deep_slope, deep_curvature = penalty(p - depth, deep)
     steep = HARDENING * deep_curvature
     force_bar = k * step.normal_bar[i, e][0]
     onset_bar = HARDENING_RANGE * HARDENING * by_onset(p - depth, deep)
-    onset_bar = force_bar * (onset_bar + share * by_onset(p, eps))
+    edge = p + constraints.ridge_lead[i, e]
+    _edge_psi, _edge_slope, edge_curvature = penalty(edge, eps)
+    onset_bar += ridge * (by_onset(edge, eps) + half * (edge_curvature - curvature))  # edges lead by half of it
+    onset_bar = force_bar * (onset_bar + beside * by_onset(p - after, eps))
     lead_bar = force_bar * (share * curvature + steep)
     depth_bar = step.normal_bar[i, e][2] - force_bar * steep * depth
 
@@ -174,6 +181,7 @@ def accumulate_cells(
     fade_shape, fade_F, _fade_n = wp.grad(fade_of)(cell_shape, ahead, face)
     cell = cell_at(cell_shape, ahead, face, gap, closing, ratio)
     fade = fade_of(cell_shape, ahead, face)
+    touched = zero
     spared = zero  # or one, far away: either does not change
     if gap <= NEAR * cell_shape.steepest:
         touched = touched_share(surface, samples.shape, samples.gap, cell_shape, fade, i, row, shape)
@@ -195,7 +203,8 @@ def accumulate_cells(
     if spared > zero:
         own = depth_bar * (wp.float64(1.0) - HARDENING_DEPTH * cell_shape.least / depth)  # a part no dent shifts
         spared_bar = (exponent * step.normal_bar[i, e][1] + own + by_log) / spared
-        spared_bar *= wp.float64(2.0) * wp.sqrt(wp.max(wp.float64(1.0) - spared, zero))  # by -c
+        growth, by_touched = shear_growth(touched)
+        spared_bar = wp.float64(2.0) * touched * spared_bar - by_touched / growth * step.normal_bar[i, e][3]  # by -c
     step.cell_spared[i, e] = spared_bar
     step.cell_fade[i, e] = wp.vec2d(fade * neighbour_at(cell_shape, fade, zero), fade)
     fade_bar = spared_bar * by_fade
@@ -214,7 +223,7 @@ def accumulate_cells(
     firm = surface.relative_stiffness[row] * surface.slenderness[row]
     powers = stiffness_exponents(instances, i, BULK_FACTOR, firm, shape_area(shapes, shape), dt)
     powers = by_log * (powers + dent_exponents(instances, i))
-    sums.contact[i, e] = sums.contact[i, e] + powers + wp.vec4d(zero, zero, zero, by_scale)
+    sums.contact[i, e] = sums.contact[i, e] + powers + wp.vec4d(zero, by_shape.poissons_ratio, zero, by_scale)
 
 
 @wp.kernel

@@ -169,7 +169,7 @@ class _Sampler:
 
     def average(self, nodes: Array, cuts: int) -> Array:
         """Return the occupancy of the voxels around nodes (N, 3), one place in each of their `cuts`^3 parts."""
-        return sum(-np.expm1(-value * self.radius) for value in self.within(nodes, cuts)) / cuts**3
+        return np.mean([-np.expm1(-value * self.radius) for value in self.within(nodes, cuts)], axis=0)
 
     def within(self, nodes: Array, cuts: int) -> Iterator[Array]:
         """Yield the density at one place in each of the `cuts`^3 parts of the voxels around nodes (N, 3)."""

@@ -6,6 +6,7 @@ Nothing is taken on trust from the build: mass, stiffness, coverage and Jacobian
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
+from softmode.checks import require_number
 from softmode.deformables.quadrature.interior import Interior, interior_from_quadrature, interior_from_surface
 from softmode.deformables.quadrature.occupancy import KEPT_EXTENT, KEPT_SHARE
 from softmode.deformables.quadrature.quadrature_density import ALLOWED, DOUBTED, FOGGY
@@ -52,6 +54,8 @@ VOID_SHARE = 0.05
 """Share of a solid above which a filled void of its field is worth a word."""
 SIZE_ERROR = 0.05
 """Longest edge that may differ so much from the size that was asked for."""
+PATCH = 3
+"""Surface samples under what presses a body from which on it presses about as it should."""
 FAST_FUNCTIONS = 56
 """Functions up to which a GPU takes all Newton iterations of a step in one launch, see ``solver.step_tables``."""
 FULL_FUNCTIONS = 100
@@ -133,6 +137,7 @@ def report_body(
     quadrature: Quadrature | None = None,
     splats: Array | None = None,
     size: float | None = None,
+    finger: float | None = None,
 ) -> BodyReport:
     """Examine a body.
 
@@ -142,6 +147,7 @@ def report_body(
             5 to 20 % that filling the surface samples anew is worth.
         splats: Centres of the splats that show it, in the body frame [m], shape (N, 3).
         size: Longest edge that was asked for [m]; None where nothing was.
+        finger: Width of what is to press it [m]; None where nothing was said.
 
     Returns:
         Measures and findings.
@@ -165,6 +171,7 @@ def report_body(
         _check_functions(body, interior, notes)
     _check_build(body, notes)
     _check_object(body, notes, splats, size)
+    _check_samples(body, notes, finger)
     return notes.report()
 
 
@@ -202,6 +209,23 @@ def _check_object(body: ReducedBody, notes: _Notes, splats: Array | None, size: 
             )
     if splats is not None:
         _check_splats(body, np.asarray(splats, dtype=np.float64), notes)
+
+
+def _check_samples(body: ReducedBody, notes: _Notes, finger: float | None) -> None:
+    """Say how wide a finger has to be for the surface samples to carry it, and how many a narrower one needs."""
+    area = body.surface.areas.sum()
+    width = notes.measure("narrowest finger that its samples carry", np.sqrt(PATCH * area / body.surface_count), "m")
+    if finger is None:
+        return
+    require_number("finger", finger, above=0.0, unit="m")
+    if finger < width:
+        under = f"{PATCH * (finger / width) ** 2:.1f} of its {body.surface_count} surface samples"
+        notes.find(
+            "warning",
+            "samples",
+            f"{under} lie under a finger of {1e3 * finger:.3g} mm, which sinks in between fewer than {PATCH}",
+            f"build it with --surface {math.ceil(PATCH * area / finger**2 - 1.0e-6)}",
+        )
 
 
 def _numbers_told(body: ReducedBody) -> dict[str, float]:

@@ -49,7 +49,8 @@ class SolverReducedOptions:
     contact_max: int | None = None
     """Contacts per instance at most; more raise the overflow flag and drop those that do not touch yet. None for one
     per surface sample of the body that has most, two where it is so thin that both sides may touch one thing, and 256
-    at least."""
+    at least. Less than these samples need is refused where there is anything to touch; what others press besides may
+    need more."""
     contact_margin: float = 0.01
     """Detection distance as a fraction of the body size, on top of twice the motion of the step."""
     soft_contact: bool = True

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -45,6 +44,7 @@ from softmode.deformables.system.factor import BlockCholesky
 from softmode.deformables.system.shared_system_kernels import shared_bytes
 from softmode.deformables.system.systems import join_systems
 from softmode.deformables.system.tile_kernels import TILE, chunk_count
+from softmode.errors import ConfigError
 
 CUDA_THREADS = 2**16
 """Threads that keep a GPU busy: sums over points are split until there are about so many."""
@@ -244,19 +244,18 @@ def allocate_tables(
         rigid: Joint dofs that take part in the solve.
 
     Raises:
-        ConfigError: If a body of the model is not among ``bodies``, or a shape cannot be touched.
+        ConfigError: If a body of the model is not among ``bodies``, a shape cannot be touched, or contact_max is less
+            than what the samples of a body need.
     """
     device = model.device
     wanted = max((sample_room(body, options.contact_margin) for body in bodies), default=0)
     room = options.contact_room(wanted)
-    if room < wanted and model.shape_count:
-        warnings.warn(
-            f"contact_max is {room}, and {wanted} samples of a body may touch something at a time: what is beyond is"
-            " left out, and flagged as contact_overflow",
-            RuntimeWarning,
-            stacklevel=3,
-        )
     layout = lay_out(model, bodies, pair_max=room // 2 if options.soft_contact else 0)
+    if room < wanted and (model.shape_count or layout.pair_max):
+        raise ConfigError(
+            f"contact_max is {room}, and {wanted} samples of a body may touch something at a time",
+            hint=f"give contact_max={wanted} or more, or None, which has room for all; or build with fewer samples",
+        )
     row_max = room + layout.pin_max if model.shape_count else 0
     instances, basis = lay_out_instances(model, layout), lay_out_bases(model, layout, row_max)
     scaled = ScaledQuantities(
