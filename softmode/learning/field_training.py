@@ -55,8 +55,8 @@ EMPTY = 6.0e-8
 THINNER, CRISP, BEFORE = 0.55, 0.1, 0.5
 """On the grid of the field, finer by two: how much its surface lies below s = 0, as its density takes light before its
 half is reached, and its beta [its voxels; nodes]; where its colours are taken [nodes before s = 0]."""
-ENOUGH = 2
-"""Nodes of a hull that pictures may contradict."""
+ENOUGH = 0.015
+"""Share of a hull's surface in a patch that pictures contradict from which on it is carved away."""
 SLACK, VOTES, CONTRAST = 2, 2, 0.06
 """Silhouettes are widened by so many pixels; a node that so many see beside one is carved; what differs so much from
 the backdrop stands before it."""
@@ -114,8 +114,8 @@ def train_field(
     half *= float((high - low).max()) / (COARSE - 1 - 2 * MARGIN)
     carved = _hull(pictures, images, back, middle, half)
     even = images / exposures[:, None, None, None]
-    while (wrong := contradicted(pictures, even, carved, middle, half)).sum() > ENOUGH:
-        carved &= ~wrong
+    while (wrong := contradicted(pictures, even, carved, middle, half))[1] > ENOUGH:
+        carved &= ~wrong[0]
     switch, fresh = int(SWITCH * steps), 0
     foggy = switch >= FIRST
     walls = Walls(_distance(carved), np.zeros((*carved.shape, 3)), fog=foggy)
@@ -168,11 +168,8 @@ def train_field(
     box = np.stack([middle - half, middle + half])
     field = RadianceGrid.from_bounds(density, c[..., None, :], box, name="trained field", metres=metres)
     full = _zoomed(s, COARSE / len(s)) < 0.0
-    core: Any = ndimage.binary_erosion(full)
-    patches: Any = ndimage.label(contradicted(pictures, even, full, middle, half), np.ones((3, 3, 3)))
-    share = np.bincount(patches[0].ravel())[1:].max(initial=0) / (full & ~core).sum()
-    allowed = float(carved.sum() / full.sum())
-    return replace(field.cropped(*field.surroundings), contradicted=float(share), allowed=allowed)
+    share, allowed = contradicted(pictures, even, full, middle, half)[1], float(carved.sum() / full.sum())
+    return replace(field.cropped(*field.surroundings), contradicted=share, allowed=allowed)
 
 
 def _cube(pictures: Sequence[PosedPicture]) -> tuple[Array, float]:

@@ -1,4 +1,4 @@
-"""`contradicted`: nodes of a solid's surface that some pictures show in one colour and others in another."""
+"""`contradicted`: the patch of a solid's surface that some pictures show in one colour and others in another."""
 
 from __future__ import annotations
 
@@ -22,8 +22,10 @@ def contradicted(
     full: NDArray[np.bool_],
     middle: NDArray[np.float64],
     half: float,
-) -> NDArray[np.bool_]:
-    """Return which nodes of a solid's surface pictures contradict (space carving, Kutulakos and Seitz 2000).
+) -> tuple[NDArray[np.bool_], float]:
+    """Return the largest patch of a solid's surface that pictures contradict, and its share of the surface.
+
+    As in space carving (Kutulakos and Seitz 2000). Single nodes are contradicted on a true surface, too.
 
     A node has any of the colours within a voxel around where a picture shows it. It is contradicted if two pictures
     have only lighter ones than two others, in a channel.
@@ -58,4 +60,6 @@ def contradicted(
         lightest = np.sort(np.concatenate([lightest, most[None]]), axis=0)[:-1]
     wrong = np.zeros_like(full)
     wrong[tuple(surface.T)] = (darkest[0] > lightest[-1] + MARGIN).any(axis=1)
-    return wrong
+    patches: Any = ndimage.label(wrong, np.ones((3, 3, 3)))
+    sizes = np.bincount(patches[0].ravel(), minlength=2)
+    return wrong & (patches[0] == 1 + sizes[1:].argmax()), float(sizes[1:].max() / max(len(surface), 1))

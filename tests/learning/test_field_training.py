@@ -75,9 +75,9 @@ def test_contradicted(tmp_path: Path) -> None:
     images = np.where(met[..., :1] > 0.0, (0.9, 0.8, 0.8), (0.5, 0.5, 0.8))
     z = np.meshgrid(*(np.linspace(-0.05, 0.05, 21),) * 3, indexing="ij")[2]
     for top, low, high in ((floor, 0.0, 0.01), (0.0, 0.1, 0.6)):
-        wrong = contradicted(shown, images, z < top + 1e-3, np.zeros(3), 0.05)
+        wrong, share = contradicted(shown, images, z < top + 1e-3, np.zeros(3), 0.05)
         assert low <= wrong.sum() / wrong[..., 0].size <= high
-        assert not wrong[z < top - 0.003].any()
+        assert not wrong[z < top - 0.003].any() and (share > 0.0) == wrong.any()
 
 
 def test_what_light_reaches_is_empty() -> None:
