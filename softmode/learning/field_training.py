@@ -52,7 +52,7 @@ BAND, AGAIN = 4.0, 150
 """Distance from the surface up to which nodes are learned [voxels], and steps after which it is found anew."""
 EMPTY = 6.0e-8
 """Weight of the light that nodes take as fog, so that there is none where no picture asks for it."""
-THINNER, CRISP, BEFORE = 0.55, 0.1, 0.5
+THINNER, CRISP, BEFORE = 0.5, 0.1, 0.5
 """On the grid of the field, finer by two: how much its surface lies below s = 0, as its density takes light before its
 half is reached, and its beta [its voxels; nodes]; where its colours are taken [nodes before s = 0]."""
 ENOUGH = 0.015
