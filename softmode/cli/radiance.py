@@ -23,7 +23,7 @@ class RadianceInfo:
         """Print nodes, degree, box, densities and what solid they show."""
         import numpy as np
 
-        from softmode.deformables.quadrature.quadrature_density import FOGGY, quadrature_from_density
+        from softmode.deformables.quadrature.quadrature_density import ALLOWED, DOUBTED, FOGGY, quadrature_from_density
         from softmode.radiance.formats import read_radiance
 
         with quiet_warp():
@@ -46,10 +46,15 @@ class RadianceInfo:
         print(f"size        {row(high - low)}")
         print(f"densities   {row(deciles)}  per unit of length (10, 50, 90 % of what is not empty)")
         print(f"opacities   {row(-np.expm1(-deciles * field.spacing))}  of a voxel, likewise")
-        print(f"solid       {solid.volume:.4g} units of length cubed; half the level of its surface adds {fog:.0%}")
+        print(f"solid       {solid.volume:.4g} units of length cubed; half its level moves it by {fog:.2g} voxels")
         print(f"voids       {filled:.0%} of it were filled, {opened:.0%} that only something thin or faint closes")
         if fog > FOGGY:
-            print("            this is fog (walls: 0 to 11 %): the solid is doubtful, and cavities may be full")
+            print("            this is fog (walls: 0 to 0.6): the solid is doubtful, and cavities may be full")
+        patch, allowed = field.contradicted or 0.0, field.allowed or 0.0
+        if field.allowed is not None:
+            print(f"pictures    contradict a patch of {patch:.1%} of its surface, allow {allowed:.2g} times its volume")
+        if patch > DOUBTED or allowed > ALLOWED:
+            print("            the solid is doubtful: cavities may be full, or their walls too thick")
         return 0
 
 

@@ -1,15 +1,18 @@
 """`train_field`: a radiance field with opaque walls out of pictures with poses before a plain wall; torch, one core.
 
-The field is a signed distance s [voxels] at the nodes of a sparse grid, of density Psi(-s / beta) / beta, where Psi is
-the distribution function of Laplace and beta shrinks (VolSDF, Yariv et al. 2021), so that it ends in walls and not in
-fog. On a coarse grid it begins as one: thin fog fills the hull of the silhouettes, and becomes dense where pictures ask
-for it. Then what light reaches is empty, and what none reaches is inside. (A hull that begins full of matter keeps a
-lid on every cavity.) Silhouettes take a backdrop that is known.
+The field is a signed distance s [voxels] at the nodes of a sparse grid. Between two places of a ray passes the share
+Phi(s / beta) has there over here, at most all, where Phi is the logistic function and beta shrinks (NeuS, Wang et al.
+2021): half the light is lost at s = 0, seen from the front and along a rim alike. (A density has its rim further out,
+and its walls elsewhere.) On a coarse grid it begins as fog, of density Psi(-s / beta) / beta, where Psi is the
+distribution function of Laplace (VolSDF, Yariv et al. 2021): thin in the hull of the silhouettes, less what their
+colours contradict, it becomes dense where pictures ask for it. Then what light reaches is empty, and what none reaches
+is inside. (Fog in all of the hull puts a lid on every cavity.) Silhouettes take a backdrop that is known.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +21,7 @@ from scipy import ndimage
 
 from softmode.checks import require_number
 from softmode.errors import AssetError, ConfigError, needs_extra
+from softmode.learning.space_carving import contradicted
 from softmode.radiance.grid import RadianceGrid
 from softmode.splats.raster.posed_pictures import PosedPicture
 from softmode.splats.splats import SH_DC
@@ -27,18 +31,19 @@ with needs_extra("rl", "training a field needs torch"):
 
 Array = NDArray[np.float64]
 
-COARSE, FINE, SWITCH, FIRST = 48, 96, 0.3, 200
+COARSE, FINE, SWITCH, FIRST, MARGIN = 48, 96, 0.35, 200, 4
 """Nodes of an edge at first and at last; the part of the steps after which the grid is refined, and how many that are
-at least if the coarse grid begins as fog, which needs them to become dense: of fewer steps it begins as the hull."""
+at least if the coarse grid begins as fog, which needs them to become dense: of fewer steps it begins as the hull. Nodes
+around the hull on every side."""
 RAYS, REGULAR = 4096, 6000
 """Rays of a step on the fine grid, half as many on the coarse one; nodes with neighbours of a step."""
-WIDEST, SHARPEST = 1.0, 0.4
-"""beta of the coarse grid, and at the end of the fine one [voxels]."""
+WIDEST, SHARPEST, STRIDE = 1.0, 0.4, 0.6
+"""beta of a grid at first, and at its end [voxels]; between samples of a ray of the fine grid [voxels]."""
 AT_ONCE = 1 << 16
 """Rays of a picture whose light is followed at a time."""
-FOG, LIT = 3.0, 0.5
-"""What nodes of the hull begin with [voxels]: a fortieth of the light is lost in a voxel; a node is lit where so much
-of the light of two pictures comes to it."""
+FOG, DENSE, LIT = 3.0, 0.7, 0.5
+"""What nodes of the hull begin with [voxels]: a fortieth of the light is lost in a voxel; below which fog is solid, a
+quarter lost; a node is lit where so much of the light of two pictures comes to it."""
 RATES = (0.1, 0.03, 3.0e-3)
 """Steps of distances [voxels], colours, and logarithms of exposures."""
 EIKONAL, SMOOTH, EVEN = 1.0e-2, 1.0e-3, 1.0e-3
@@ -47,6 +52,11 @@ BAND, AGAIN = 4.0, 150
 """Distance from the surface up to which nodes are learned [voxels], and steps after which it is found anew."""
 EMPTY = 6.0e-8
 """Weight of the light that nodes take as fog, so that there is none where no picture asks for it."""
+THINNER, CRISP, BEFORE = 0.5, 0.1, 0.5
+"""On the grid of the field, finer by two: how much its surface lies below s = 0, as its density takes light before its
+half is reached, and its beta [its voxels; nodes]; where its colours are taken [nodes before s = 0]."""
+ENOUGH = 0.015
+"""Share of a hull's surface in a patch that pictures contradict from which on it is carved away."""
 SLACK, VOTES, CONTRAST = 2, 2, 0.06
 """Silhouettes are widened by so many pixels; a node that so many see beside one is carved; what differs so much from
 the backdrop stands before it."""
@@ -56,7 +66,7 @@ def train_field(
     pictures: Sequence[PosedPicture],
     *,
     wall: Sequence[float] = (1.0, 1.0, 1.0),
-    steps: int = 1500,
+    steps: int = 1000,
     seed: int = 0,
     metres: float | None = None,
     progress: Callable[[int, float], None] | None = None,
@@ -69,7 +79,7 @@ def train_field(
     Args:
         pictures: The pictures; the border of each is the wall. The object is where their axes meet.
         wall: Colour of the wall, sRGB 0..1. Where the object has it too, no picture says where its surface is.
-        steps: Steps; 1,500 take two minutes on one core.
+        steps: Steps; 1,000 take two minutes on one core.
         seed: Seed of rays.
         metres: Metres of a unit of the poses, None if not known.
         progress: Called with the step and the mean squared error after every step.
@@ -99,6 +109,13 @@ def train_field(
     carved = _hull(pictures, images, back, middle, half)
     if not carved.any():
         raise AssetError("the silhouettes have nothing in common", hint="check poses, lens and that the wall is plain")
+    low, high = np.argwhere(carved).min(axis=0) - 0.5, np.argwhere(carved).max(axis=0) + 0.5
+    middle = middle - half + (low + high) * half / (COARSE - 1)
+    half *= float((high - low).max()) / (COARSE - 1 - 2 * MARGIN)
+    carved = _hull(pictures, images, back, middle, half)
+    even = images / exposures[:, None, None, None]
+    while (wrong := contradicted(pictures, even, carved, middle, half))[1] > ENOUGH:
+        carved &= ~wrong[0]
     switch, fresh = int(SWITCH * steps), 0
     foggy = switch >= FIRST
     walls = Walls(_distance(carved), np.zeros((*carved.shape, 3)), fog=foggy)
@@ -110,18 +127,21 @@ def train_field(
     target, each = torch.tensor(images.reshape(-1, 3)), images[0, ..., 0].size
     first, last = _reach(walls, eyes.repeat_interleave(each, 0), ways, 2.0 * half)
     hit = (last > first).nonzero()[:, 0]
+    parts = hit.split(torch.bincount(hit // each, minlength=len(images)).tolist())
+
+    def lit(walls: Walls) -> np.ndarray:
+        """Return which nodes light of two pictures comes to."""
+        voxel = 2.0 * half / (walls.n - 1)
+        found = [
+            walls.lit(eye / voxel, ways[ray], first[ray] / voxel, last[ray] / voxel)
+            for eye, ray in zip(eyes, parts, strict=True)
+        ]
+        return torch.stack(found).sum(0).numpy() > 1
+
     for step in range(steps):
         size = FINE if step >= switch else COARSE
-        if foggy and step == switch:
-            foggy, voxel = False, 2.0 * half / (walls.n - 1)
-            parts = hit.split(torch.bincount(hit // each, minlength=len(images)).tolist())
-            lit = [
-                walls.lit(eye / voxel, ways[ray], first[ray] / voxel, last[ray] / voxel)
-                for eye, ray in zip(eyes, parts, strict=True)
-            ]
-            walls, fresh = walls.anew(size, torch.stack(lit).sum(0).numpy() > 1), step
-        elif size != walls.n or (step - fresh >= AGAIN and not foggy and step < 0.9 * steps):
-            walls, fresh = walls.anew(size), step
+        if size != walls.n or (step - fresh >= AGAIN and not foggy and step < 0.9 * steps):
+            walls, fresh, foggy = walls.anew(size, lit(walls) if foggy else None), step, False
         part = (step - switch) / (steps - switch) if step >= switch else step / switch
         beta = WIDEST if foggy else WIDEST * (SHARPEST / WIDEST) ** min(part / 0.7, 1.0)
         for group, rate in zip(walls.optimiser.param_groups, RATES, strict=False):
@@ -129,7 +149,7 @@ def train_field(
         ray = hit[torch.randint(len(hit), (RAYS // 2 if foggy else RAYS,))]
         voxel, of = 2.0 * half / (walls.n - 1), ray // each
         near, far = first[ray] / voxel, last[ray] / voxel
-        color, left = walls.march(eyes[of] / voxel, ways[ray], near, far, min(0.7, 1.2 * beta), beta)
+        color, left = walls.march(eyes[of] / voxel, ways[ray], near, far, STRIDE, beta)
         seen = torch.exp(gain)[of, None] * (color + left[:, None] * plain)
         error = ((torch.minimum(seen, 1.0 + 0.01 * (seen - 1.0)) - target[ray]) ** 2).mean()  # cut at white
         for optimiser in (walls.optimiser, gains):
@@ -141,13 +161,15 @@ def train_field(
         if progress is not None:
             progress(step + 1, error.item())
     s, c = walls.dense()
-    s, c = 2.0 * _zoomed(s, 2.0), _zoomed(c, 2.0)
-    beta = 2.0 * SHARPEST  # on the finer grid, which keeps walls sharper than their nodes
+    s, c = 2.0 * _zoomed(s, 2.0), _zoomed(_in_front(s, c), 2.0)
+    beta, s = 2.0 * CRISP, s + THINNER
     tail = 0.5 * np.exp(-np.abs(s) / beta)
     density = np.where(s > 0.0, tail, 1.0 - tail) * (len(s) - 1) / (2.0 * half * beta)
     box = np.stack([middle - half, middle + half])
     field = RadianceGrid.from_bounds(density, c[..., None, :], box, name="trained field", metres=metres)
-    return field.cropped(*field.surroundings)
+    full = _zoomed(s, COARSE / len(s)) < 0.0
+    share, allowed = contradicted(pictures, even, full, middle, half)[1], float(carved.sum() / full.sum())
+    return replace(field.cropped(*field.surroundings), contradicted=share, allowed=allowed)
 
 
 def _cube(pictures: Sequence[PosedPicture]) -> tuple[Array, float]:
@@ -192,6 +214,18 @@ def _zoomed(values: Array, zoom: float) -> Array:
     return found
 
 
+def _in_front(s: Array, c: Array) -> Array:
+    """Return colours (n, n, n, 3) of nodes near a surface where light is lost on its way to them: before s = 0."""
+    near = np.abs(s) < 3.0
+    slopes: Any = np.gradient(ndimage.gaussian_filter(s, 0.5))
+    out = np.stack([slope[near] for slope in slopes])
+    out *= (BEFORE - s[near]) / np.maximum((out**2).sum(axis=0), 0.25)
+    at, moved = np.argwhere(near).T + out, c.copy()
+    for k in range(3):
+        moved[near, k] = ndimage.map_coordinates(c[..., k], at, order=1, mode="nearest")
+    return moved
+
+
 def _reach(walls: Walls, eye: torch.Tensor, way: torch.Tensor, edge: float) -> tuple[torch.Tensor, torch.Tensor]:
     """Return where rays come to the nodes that are learned, and where they leave them; last < first where nowhere."""
     voxel = edge / (walls.n - 1)
@@ -221,7 +255,7 @@ class Walls:
         start = FOG + np.maximum(distance, 0.0) if fog else distance
         table = np.column_stack([start.ravel(), shades.reshape(-1, 3)])[kept]
         table = np.concatenate([[[30.0, 0.0, 0.0, 0.0], [-30.0, 0.0, 0.0, 0.0]], table])
-        self.n, self.near, self.rows = n, near, torch.tensor(rows)
+        self.n, self.near, self.rows, self.fog = n, near, torch.tensor(rows), fog
         self.s = torch.tensor(table[:, :1], dtype=torch.float32, requires_grad=True)
         self.c = torch.tensor(table[:, 1:], dtype=torch.float32, requires_grad=True)
         self.cells = torch.tensor(ndimage.maximum_filter(near, 2, origin=-1).ravel())
@@ -239,14 +273,15 @@ class Walls:
     def anew(self, n: int, lit: np.ndarray | None = None) -> Walls:
         """Return them with true distances from the surface of the largest part, perhaps on a finer grid.
 
-        What was fog is full where it is dense, not `lit` (n^3,), or enclosed but for holes of a node.
+        What was fog is full where it is dense, not `lit` (n^3,), or enclosed but for holes of some nodes.
         """
         s, c = self.dense()
         zoom = n / self.n
         if lit is not None:
+            s = s - DENSE
             within: Any = ndimage.binary_erosion(self.near, iterations=2)
             solid: Any = (s < 0.0) | (within & ~lit.reshape(s.shape))
-            whole: Any = ndimage.binary_fill_holes(ndimage.binary_closing(solid))
+            whole: Any = ndimage.binary_fill_holes(ndimage.binary_closing(solid, iterations=2))
             s = np.where(solid | ndimage.binary_erosion(whole), -np.abs(s), np.abs(s))
         s = _zoomed(np.clip(s, -3.0, 3.0), zoom) * zoom
         found: Any = ndimage.label(s < 0.0)
@@ -259,7 +294,7 @@ class Walls:
         return Walls(s, _zoomed(c, zoom) if zoom != 1.0 else c)
 
     def matter(self) -> torch.Tensor:
-        """Return the sum of the light that nodes take within a voxel."""
+        """Return the sum of the light that nodes of fog take within a voxel."""
         half = 0.5 * torch.exp(-self.s[2:].abs() / WIDEST)
         return (1.0 - torch.exp(-torch.where(self.s[2:] > 0.0, half, 1.0 - half) / WIDEST)).sum()
 
@@ -289,13 +324,18 @@ class Walls:
 
     def _depths(
         self, shape: torch.Size, use: torch.Tensor, rows: torch.Tensor, weight: torch.Tensor, step: float, beta: float
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return optical depths of samples (R, S), and the light that comes to each."""
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return optical depths of samples (R, S), the light that comes to each, and where the first is not 0."""
         s = (self.s.index_select(0, rows.reshape(-1)).reshape(-1, 8) * weight).sum(1)
-        half = 0.5 * torch.exp(-s.abs() / beta)
-        tau = torch.where(s > 0.0, half, 1.0 - half) * (step / beta)
-        full = torch.zeros(shape.numel()).index_put((use,), tau).reshape(shape)
-        return full, torch.exp(full - full.cumsum(1))
+        if self.fog:
+            half = 0.5 * torch.exp(-s.abs() / beta)
+            tau = torch.where(s > 0.0, half, 1.0 - half) * (step / beta)
+            there = full = torch.zeros(shape.numel()).index_put((use,), tau).reshape(shape)
+        else:
+            far = torch.full((shape.numel(),), 30.0).index_put((use,), s).reshape(shape)
+            there = torch.nn.functional.softplus(-far / beta)
+            full = torch.relu(there.diff(dim=1, append=there[:, -1:]))
+        return full, torch.exp(full - full.cumsum(1)), there
 
     @torch.no_grad()
     def lit(self, eye: torch.Tensor, way: torch.Tensor, first: torch.Tensor, last: torch.Tensor) -> torch.Tensor:
@@ -315,10 +355,10 @@ class Walls:
         """Return colour times coverage (R, 3) and light left (R,) of rays [voxels] between two places each."""
         shape, use, rows, weight = self._samples(eye, way, first, last, step)
         with torch.no_grad():
-            tau, light = (x.reshape(-1)[use] for x in self._depths(shape, use, rows, weight, step, beta))
-            seen = (tau > 1e-4) & (light > 1e-3)
+            _, light, there = (x.reshape(-1)[use] for x in self._depths(shape, use, rows, weight, step, beta))
+            seen = (there > 1e-4) & (light > 1e-3)
         rows, weight, use = rows[seen], weight[seen], use[seen]
-        tau, light = self._depths(shape, use, rows, weight, step, beta)
+        tau, light, _ = self._depths(shape, use, rows, weight, step, beta)
         share = (light * (1.0 - torch.exp(-tau))).reshape(-1)[use]
         color = 0.5 + SH_DC * (self.c.index_select(0, rows.reshape(-1)).reshape(-1, 8, 3) * weight[..., None]).sum(1)
         color = torch.zeros(len(way), 3).index_add(0, use // shape[1], share[:, None] * color)

@@ -171,7 +171,9 @@ def _field_source(config: ObjectConfig, given: str | Path | RadianceGrid) -> Obj
         quadrature_from_density, grid.densities, grid.surroundings, surface_count=config.surface_count, **options
     )
     fitted = config.size if config.size is not None or grid.metres else SIZE
-    return ObjectSource(baked, solid, grid.name, ("fog", *key, config.resolution), baked.count, fitted, grid, pose)
+    doubt: dict[str, str | int | float] = {"contradicted": grid.contradicted or 0.0, "allowed": grid.allowed or 0.0}
+    made = ("cut", *key, *doubt.values(), config.resolution)
+    return ObjectSource(baked, solid, grid.name, made, baked.count, fitted, grid, pose, capture=doubt)
 
 
 def _shape_source(shape: Primitive, config: ObjectConfig, extents: Extents) -> ObjectSource:

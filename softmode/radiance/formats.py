@@ -23,6 +23,7 @@ from softmode.splats.formats.others import refuse_others
 SUFFIXES = (".npz", ".nvdb")
 """What fields are read from."""
 _OURS = ("density", "sh", "origin", "axes")
+_NUMBERS = ("metres", "contradicted", "allowed")
 _PLAIN = ("density", "bounds")
 _PLENOXELS = ("links", "density_data", "sh_data", "radius", "center")
 _HINT = "export it again"
@@ -67,12 +68,13 @@ def read_radiance(path: str | os.PathLike[str]) -> RadianceGrid:
 
 def _read_npz(file: Path) -> RadianceGrid:
     """Return the field of an .npz."""
-    names = {*_OURS, *_PLAIN, *_PLENOXELS, *PLENOCTREE, "rgb", "basis_type", "metres"}
+    names = {*_OURS, *_PLAIN, *_PLENOXELS, *PLENOCTREE, "rgb", "basis_type", *_NUMBERS}
     arrays = read_arrays(file, names, what="radiance field", hint=_HINT, free=_FREE)
     name = file.name
-    metres = float(arrays["metres"]) if "metres" in arrays else None
+    known = {key: float(arrays[key]) if key in arrays else None for key in _NUMBERS}
     if set(arrays) >= set(_OURS):
-        return RadianceGrid(**{key: arrays[key] for key in _OURS}, name=name, metres=metres)
+        density, sh, origin, axes = (arrays[key] for key in _OURS)
+        return RadianceGrid(density=density, sh=sh, origin=origin, axes=axes, name=name, **known)
     if set(arrays) >= set(_PLENOXELS):
         return _plenoxels(arrays, name)
     if set(arrays) >= set(PLENOCTREE):
@@ -84,7 +86,7 @@ def _read_npz(file: Path) -> RadianceGrid:
             " or child, data, data_format, invradius3 and offset of a PlenOctree",
         )
     sh = arrays["sh"] if "sh" in arrays else _colors(arrays["rgb"], name)
-    return RadianceGrid.from_bounds(arrays["density"], sh, arrays["bounds"], name=name, metres=metres)
+    return RadianceGrid.from_bounds(arrays["density"], sh, arrays["bounds"], name=name, metres=known["metres"])
 
 
 def write_radiance(path: str | os.PathLike[str], field: RadianceGrid) -> None:
@@ -96,8 +98,8 @@ def write_radiance(path: str | os.PathLike[str], field: RadianceGrid) -> None:
     """
     if Path(path).suffix.lower() != ".npz":
         raise AssetError(f"radiance field {path}: cannot write this kind", hint="name it like toy.npz")
-    unit = {} if field.metres is None else {"metres": np.array(field.metres)}
-    write_compressed(path, {name: getattr(field, name) for name in _OURS} | unit, "radiance field")
+    known = {name: np.array(getattr(field, name)) for name in _NUMBERS if getattr(field, name) is not None}
+    write_compressed(path, {name: getattr(field, name) for name in _OURS} | known, "radiance field")
 
 
 def _colors(rgb: NDArray[Any], name: str) -> NDArray[np.float16]:

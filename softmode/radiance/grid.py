@@ -51,6 +51,10 @@ class RadianceGrid:
     """Where it comes from; used in messages."""
     metres: float | None = None
     """Metres of one unit of its lengths, if its file says so; then an object of it has its size. None if not known."""
+    contradicted: float | None = None
+    """Share of its surface in the largest patch that the pictures it was trained on contradict. None if not known."""
+    allowed: float | None = None
+    """Volume of the largest solid that those pictures do not contradict, over that of its own. None if not known."""
 
     def __post_init__(self) -> None:
         """Convert, validate and freeze the arrays."""

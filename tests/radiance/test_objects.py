@@ -165,7 +165,11 @@ def test_commands(file, tmp_path, capsys):
     """`radiance info` prints what is in the file, `bake` writes splats; what is wrong ends with 2 and a remedy."""
     assert main(["radiance", "info", str(file)]) == 0
     said = capsys.readouterr().out
-    assert "sh degree   0" in said and "97 x" in said and "adds 2%" in said and "fog" not in said
+    assert "sh degree   0" in said and "97 x" in said and "moves it by 0.0" in said and "fog" not in said
+    doubted = tmp_path / "doubted.npz"
+    write_radiance(doubted, replace(block_field(), contradicted=0.06, allowed=1.2))
+    assert main(["radiance", "info", str(doubted)]) == 0
+    assert "a patch of 6.0%" in (said := capsys.readouterr().out) and "doubtful" in said
     out = tmp_path / "block.ply"
     given = ["--count", "800", "--iterations", "10", "--pixels", "48", "--out", str(out)]
     assert main(["radiance", "bake", str(file), *given]) == 0

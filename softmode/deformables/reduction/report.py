@@ -17,7 +17,7 @@ from scipy.spatial import ConvexHull, QhullError
 from softmode.checks import require_number
 from softmode.deformables.quadrature.interior import Interior, interior_from_quadrature, interior_from_surface
 from softmode.deformables.quadrature.occupancy import KEPT_EXTENT, KEPT_SHARE
-from softmode.deformables.quadrature.quadrature_density import FOGGY
+from softmode.deformables.quadrature.quadrature_density import ALLOWED, DOUBTED, FOGGY
 from softmode.deformables.reduction.basis import KERNEL_POINTS
 from softmode.deformables.reduction.cubature import POISSON_RATIO
 from softmode.deformables.reduction.elastic_functions import EXCESS, EXCESS_WARNING
@@ -545,9 +545,19 @@ def _check_asset(body: ReducedBody, told: dict[str, float], notes: _Notes) -> No
         notes.find(
             "warning",
             "fog",
-            f"the field is fog: half the level of its surface adds {100.0 * fog:.0f} % of volume (walls: 0 to 11 %)."
+            f"the field is fog: half the level moves its surface by {fog:.2g} voxels (walls: 0 to 0.6)."
             f" Its solid is taken at {told['quadrature_level_share']:.2g} of full occupancy; cavities may be full",
             "train it with opaque walls (examples/train_field.py), or build from a mesh of the object",
+        )
+    patch, allowed = told.get("quadrature_contradicted", 0.0), told.get("quadrature_allowed", 0.0)
+    if patch > DOUBTED or allowed > ALLOWED:
+        notes.find(
+            "warning",
+            "doubtful solid",
+            f"its pictures contradict a patch of {100.0 * patch:.1f} % of its surface (a lid over a cavity: 6 and more)"
+            f" and allow solids of up to {allowed:.1f} times its volume, since a cavity of one colour does not show how"
+            " deep it is and how thick its wall",
+            "measure a wall, train with more pictures that look into the cavity, or build from a mesh of the object",
         )
     filled, opened = told.get("quadrature_filled_share", 0.0), told.get("quadrature_open_share", 0.0)
     if max(filled, opened) > VOID_SHARE:
