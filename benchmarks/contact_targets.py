@@ -329,7 +329,7 @@ def gradient(kind: str, name: str) -> Figure:
     elif kind == "edge":
         turn, height, omega = rotation((0, 1, 0), 0.23 * np.pi), 0.0714, (0.0, 1.0, 0.0)
     soft.q.assign(I[:, :3] @ (turn.T - np.eye(3)) + I[:, 3:] * np.array([0.0, 0.0, height]))
-    soft.qd.assign(I[:, :3] @ turn.T @ np.cross(omega, np.eye(3)).T.T + I[:, 3:] * np.array(v))
+    soft.qd.assign(I[:, :3] @ turn.T @ np.cross(omega, np.eye(3)) + I[:, 3:] * np.array(v))
     case.least = 0
     found = case.gradient(case.gradients(), name)
     scale = 0.1 if name == "qd" else 1.0
@@ -389,11 +389,10 @@ def cases() -> Iterator[Case]:
         for body in ("cylinder", "torus", "ball of 1500"):
             name = f"{body}, {degrees} degrees, E {modulus:g}"
             yield Case(f"{body} down {degrees} degrees", name, *goal, roll, (body, modulus, degrees))
-    for modulus, (viscosity, low) in itertools.product((1.0e5, 1.0e6), ((0.0, 0.99), (0.002, 0.97))):
+    kept = {0.0: (0.99, 1.0), 0.002: (0.55, 0.59)}  # exp(-5/7 g viscosity seconds / R) where all of it is viscous
+    for modulus, (viscosity, goal) in itertools.product((1.0e5, 1.0e6), kept.items()):
         name = f"viscosity {viscosity}, E {modulus:g}"
-        yield Case(
-            f"level, viscosity {viscosity}", name, low, 1.0, roll, ("ball", modulus, 0.0, 0.0, "plane", viscosity)
-        )
+        yield Case(f"level, viscosity {viscosity}", name, *goal, roll, ("ball", modulus, 0.0, 0.0, "plane", viscosity))
     for body, modulus in itertools.product(("cube", "ball"), (1.0e4, 1.0e5, 1.0e6)):
         yield Case(f"at rest, {body}", f"{body}, E {modulus:g}", 0.0, 1.0e-9, rest, (body, modulus))
     for kind, modulus, dt in itertools.product(("ball", "cube", "tilted cube"), (1.0e5, 1.0e6), (DT, 0.001)):
@@ -435,6 +434,8 @@ def main() -> None:
     parser.add_argument("--table", action="store_true")
     given = parser.parse_args()
     chosen = [case for case in cases() if case.row.startswith(tuple(given.only))]
+    if not chosen:
+        parser.error(f"no row begins with {' or '.join(given.only)}; rows: {', '.join({c.row: 0 for c in cases()})}")
     rows: dict[str, list[dict[str, Any]]] = {}
     with multiprocessing.get_context("spawn").Pool(given.jobs) as pool:
         for found in pool.imap_unordered(measure, chosen):

@@ -16,7 +16,7 @@ import numpy as np
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from softmode.deformables import BuildOptions, Material, SolverReducedOptions
+from softmode.deformables import BuildOptions, Material
 from softmode.objects import ObjectConfig, Placed, load
 from softmode.scenes import Record, SplatScene
 from softmode.splats import CameraOptions, PinholeCamera, ShadowOptions
@@ -54,7 +54,7 @@ def make_scene(own: list[str | ObjectConfig], seed: int, size: int, device: str 
     eye, target = (0.31, -0.23, 0.64), (0.0, 0.0, 0.09)
     camera = PinholeCamera.look_at("film", position=eye, target=target, width=size, height=size, fov_y=0.72)
     light = CameraOptions(mesh_samples=4, splat_shadow=ShadowOptions(cells=160))
-    fine = {"dt": 1.0 / 360.0, "steps_per_frame": 12, "options": SolverReducedOptions(contact_max=512)}
+    fine = {"dt": 1.0 / 360.0, "steps_per_frame": 12}
     return SplatScene(world, placed, cameras=[camera], camera_options=light, device=device, **fine)
 
 

@@ -251,9 +251,8 @@ def _examined(options: _Asset) -> tuple[SoftObject, BodyReport]:
     path = options.path
     toy = options.toy if options.file is None else dataclasses.replace(options.toy, object=path)
     if toy.splat is None and toy.preset is None and file_kind(path) == "body":
-        given = [
-            f.name for f in dataclasses.fields(_Asset)[1:-2] if getattr(options, f.name) != f.default
-        ]  # file, toy, finger
+        own = dataclasses.fields(_Asset)[1:-2]  # all but file, toy and finger
+        given = [f.name for f in own if getattr(options, f.name) != f.default]
         given = [typed(name) for name in (*given, *toy.shape)]
         if given or isinstance(options, BodyBuild):
             raise ConfigError(
@@ -277,8 +276,8 @@ def _examined(options: _Asset) -> tuple[SoftObject, BodyReport]:
     made_of = {**stored_material(body), **toy.material}
     if made_of:
         body = dataclasses.replace(body, provenance={**body.provenance, "material": json.dumps(made_of)})
-    asked: dict[str, float | None] = {"size": found.size_asked, "finger": options.finger}
-    report = report_body(body, quadrature=quadrature, splats=splats.means, **asked)
+    asked = found.size_asked
+    report = report_body(body, quadrature=quadrature, splats=splats.means, size=asked, finger=options.finger)
     return dataclasses.replace(found, body=body, splats=splats), report
 
 

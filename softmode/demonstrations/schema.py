@@ -42,7 +42,7 @@ ORIGINS_PATH, CARD_PATH = "meta/softmode.json", "README.md"
 STATE_PATH = "meta/states/episode-{number:06d}.npz"
 IMAGE_NAMES = ("height", "width", "channels")
 GOALS = ("achieved_goal", "desired_goal")
-"""Keys of the goals in observations of environments with goals; their features are ``observation.KEY``."""
+"""Keys of the goals in observations of environments with goals; their features begin with ``observation``."""
 
 
 def place_of(number: int) -> dict[str, int]:

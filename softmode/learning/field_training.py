@@ -89,7 +89,7 @@ def train_field(
 
     Raises:
         AssetError: If the pictures are of several sizes, their border is not the wall, or their silhouettes have
-            nothing in common.
+            nothing in common, or they contradict all of what is in them.
         ConfigError: If the number of steps is not positive, or the wall is no colour, or black.
     """
     require_number("steps", steps, at_least=1)
@@ -116,6 +116,8 @@ def train_field(
     even = images / exposures[:, None, None, None]
     while (wrong := contradicted(pictures, even, carved, middle, half))[1] > ENOUGH:
         carved &= ~wrong[0]
+    if not carved.any():
+        raise AssetError("the pictures contradict all of the hull", hint="check poses, lens and exposures")
     switch, fresh = int(SWITCH * steps), 0
     foggy = switch >= FIRST
     walls = Walls(_distance(carved), np.zeros((*carved.shape, 3)), fog=foggy)

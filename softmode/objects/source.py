@@ -172,7 +172,7 @@ def _field_source(config: ObjectConfig, given: str | Path | RadianceGrid) -> Obj
     )
     fitted = config.size if config.size is not None or grid.metres else SIZE
     doubt: dict[str, str | int | float] = {"contradicted": grid.contradicted or 0.0, "allowed": grid.allowed or 0.0}
-    made = ("cut", *key, *doubt.values(), config.resolution)
+    made = ("depth", *key, *doubt.values(), config.resolution)
     return ObjectSource(baked, solid, grid.name, made, baked.count, fitted, grid, pose, capture=doubt)
 
 

@@ -77,6 +77,10 @@ class RadianceGrid:
             raise AssetError(f"{self.name}: density is {density.max():.3g} 1/m everywhere", hint=hint)
         if self.metres is not None and not (np.isfinite(self.metres) and self.metres > 0.0):
             raise AssetError(f"{self.name}: a unit of {self.metres} metres", hint="give a positive number, or none")
+        for name in ("contradicted", "allowed"):
+            value = getattr(self, name)
+            if value is not None and not (np.isfinite(value) and value >= 0.0):
+                raise AssetError(f"{self.name}: {name} is {value}", hint="give zero or a positive number, or none")
         origin, axes = np.array(self.origin, dtype=np.float64), np.array(self.axes, dtype=np.float64)
         lengths = np.linalg.norm(axes, axis=0) if axes.shape == (3, 3) else np.zeros(3)
         proper = axes.shape == (3, 3) and origin.shape == (3,) and np.isfinite([*axes.ravel(), *origin]).all()

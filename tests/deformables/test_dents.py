@@ -121,11 +121,11 @@ class Press:
 def test_hertz(poissons_ratio: float) -> None:
     """A sphere between plates, as users get it, presses as Hertz's, made finite: within 7 % from 2 to 8 % of R.
 
-    Within 8 % at 1 %, where its patch lies in two cells.
+    Within 10 % at 1 %, where its patch lies in two cells: 6.4 % with AVX-512, 7.1 % without.
     """
     press = Press(default_ball(poissons_ratio), RADIUS, poissons_ratio=poissons_ratio)
     for share in (0.01, 0.02, 0.04, 0.08):
-        depth, error = share * RADIUS, 0.08 if share == 0.01 else 0.07
+        depth, error = share * RADIUS, 0.1 if share == 0.01 else 0.07
         assert press.force(depth) == pytest.approx(hertz(depth, 1.0e6, poissons_ratio), rel=error), share
 
 

@@ -241,8 +241,9 @@ def march(
     """Return gap and normal of the half-space that stands for a shape along a way from ``x``, in the shape's frame.
 
     The way is marched by distances to the shape grown by ``thick``. To the body's inside (``back``), for a sample past
-    the middle of a thin plate or through it: where the way leaves the shape, else what is ``nearest`` to x. The way of
-    a fast sample: where it first meets the shape, or else passes nearest, with no ``onset`` of its contact.
+    the middle of a thin plate, through it, or beside the flank of a box: where the way leaves the shape, else what is
+    ``nearest`` to x. The way of a fast sample: where it first meets the shape, or else passes nearest, with no
+    ``onset`` of its contact.
     """
     kind = shapes.kind[shape]
     scale = shapes.scale[shape]
@@ -403,6 +404,7 @@ def find_contacts(
                 end = 2.0 * depth
                 back = 1
             elif kind == BOX and query.distance <= 0.0 and wp.dot(query.normal, inner) < OPPOSED * depth:
+                # beside a flank, under the rim of a finger: not aside, from as deep as contact with edges dents
                 along = inner / depth
                 end = 0.3 * OVERLAP * instances.size[i]
                 back = 1

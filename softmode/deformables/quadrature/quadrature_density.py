@@ -112,9 +112,9 @@ def quadrature_from_density(
     axes = [origin[d] + voxel * np.arange(shape[d]) for d in range(3)]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     sampler = _Sampler(sigma, box, voxel, 2.0 * voxel if radius is None else radius, seed)
-    solid, level, report = _solid(_occupancy(sampler, nodes), fill_voids)
+    solid, level, void, report = _solid(_occupancy(sampler, nodes), fill_voids)
     if report["level_share"] == LEVELS[0]:
-        _cut(sampler, nodes, solid, level)
+        _cut(sampler, nodes, solid, level, void)
 
     def interpolated(field: Array, x: Array) -> Array:
         where = ((x - origin) / voxel).T
@@ -205,8 +205,8 @@ def _occupancy(sampler: _Sampler, nodes: Array) -> Array:
     return found
 
 
-def _solid(occupancy: Array, fill_voids: bool) -> tuple[Array, float, dict[str, float]]:
-    """Return the occupancy of the largest part, the level of its surface, and what was left out and filled."""
+def _solid(occupancy: Array, fill_voids: bool) -> tuple[Array, float, NDArray[np.bool_], dict[str, float]]:
+    """Return the occupancy of the largest part, its surface's level, where it was filled, and shares of what was."""
     full = float(np.quantile(occupancy[occupancy > FAINT], 0.95))
 
     @functools.cache
@@ -236,7 +236,7 @@ def _solid(occupancy: Array, fill_voids: bool) -> tuple[Array, float, dict[str, 
     # What borders on a void but not on the outside is full, and so is fog.
     beside: Any = ndimage.binary_dilation(void) if share == LEVELS[0] else whole
     solid[void | (beside & ndimage.binary_erosion(whole))] = 2.0 * level
-    return solid, level, {
+    return solid, level, void, {
         "level": level,
         "level_share": share,
         "fog": fog,
@@ -246,10 +246,11 @@ def _solid(occupancy: Array, fill_voids: bool) -> tuple[Array, float, dict[str, 
     }  # fmt: skip
 
 
-def _cut(sampler: _Sampler, nodes: Array, solid: Array, level: float) -> None:
+def _cut(sampler: _Sampler, nodes: Array, solid: Array, level: float, void: NDArray[np.bool_]) -> None:
     """Move the surface of a solid to where light that comes along its normal has lost an optical depth of `DEPTH`.
 
-    The density there, or half of the largest beyond if that is less, is the level of a voxel's surface.
+    The density there, or half of the largest beyond if that is less, is the level of a voxel's surface. Beside a filled
+    void, whose density is none, all counts that lies behind that place.
     """
     full, cube = solid > level, np.ones((3, 3, 3))
     core: Any = ndimage.binary_erosion(full, cube, 2)
@@ -258,17 +259,22 @@ def _cut(sampler: _Sampler, nodes: Array, solid: Array, level: float) -> None:
     out = -np.stack([slope[band] for slope in slopes], axis=1)
     out /= np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-12)
     before, reached, surface, most = (np.zeros(len(out)) for _ in range(4))
+    place = np.full(len(out), -REACH)
     for t in np.arange(REACH, -REACH, -STEP):
         here = sampler.at(nodes[band] + sampler.voxel * t * out)
         depth = reached + 0.5 * STEP * sampler.voxel * (before + here)
         # Between two places the density is linear, and the depth a parabola.
         squared = before**2 + 2.0 * (here - before) * (DEPTH - reached) / (STEP * sampler.voxel)
         crossed = np.sqrt(np.maximum(squared, 0.0))
-        surface = np.where((reached < DEPTH) & (depth >= DEPTH), crossed, surface)
+        there = (reached < DEPTH) & (depth >= DEPTH)
+        surface = np.where(there, crossed, surface)
+        place = np.where(there, t + STEP * (depth - DEPTH) / np.maximum(depth - reached, 1e-12), place)
         before, reached, most = here, depth, np.maximum(most, here)
     surface = np.where(reached < DEPTH, most, np.minimum(surface, 0.5 * most))
-    parts = [value > surface for value in sampler.within(nodes[band], 3)]
-    solid[band] = 2.0 * level * np.mean(parts, axis=0)
+    share = np.mean([value > surface for value in sampler.within(nodes[band], 3)], axis=0)
+    near: Any = ndimage.binary_dilation(void, cube)
+    share = np.where(near[band], np.maximum(share, np.clip(place + 0.5, 0.0, 1.0)), share)
+    solid[band] = 2.0 * level * np.where(void[band], 1.0, share)
 
 
 def disk_radii(slope: Array, spacing: float) -> Array:
