@@ -197,6 +197,8 @@ def twisted(kind: str, depth: float) -> tuple[float, list[float]]:
             u += min(1.0, CAP / most) * step
             if most < 2.0e-6:
                 break
+        else:
+            print(f"{kind}, depth {depth * (k + 1) / count:.4f}: not converged")
         finger.keep()
     start = top()
     finger.move(start, depth, 0.0)
@@ -224,6 +226,8 @@ def twisted(kind: str, depth: float) -> tuple[float, list[float]]:
             w += min(1.0, CAP / np.abs(step).max()) * step
             if np.abs(step).max() < 1.0e-8:
                 break
+        else:
+            print(f"{kind}, twist {angle:g}: not converged")
         finger.keep()
         torques.append(4.0 * float((place[:, 0] * now[:, 1] - place[:, 1] * now[:, 0]).sum()))
     return -4.0 * float(force[:, 2].sum()), torques
