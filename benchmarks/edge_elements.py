@@ -23,7 +23,7 @@ from scipy import sparse
 from scipy.sparse import linalg
 from scipy.spatial import KDTree
 
-from benchmarks.hertz_elements import Array, Ints, Mask, integrate, stress
+from benchmarks.hertz_elements import Array, Ints, Mask, elastic, integrate
 
 DEPTHS = (0.01, 0.02, 0.03, 0.05)
 """Over the edge."""
@@ -138,20 +138,21 @@ def only(x: Array, held: Mask) -> sparse.csr_matrix:
 
 
 def symmetric(x: Array, group: Sequence[Array]) -> sparse.csr_matrix:
-    """Return the motions of nodes that are the same under a group of matrices, which map the nodes to each other."""
-    images = [np.asarray(KDTree(x).query(x @ g.T)[1]) for g in group]
-    seen: set[int] = set()
+    """Return the motions of nodes that are the same under a group of matrices; images may lie outside of the nodes."""
+    tree, images = KDTree(x), []
+    for g in group:
+        distance, image = tree.query(x @ g.T)
+        images.append(np.where(np.asarray(distance) < 1.0e-9, image, -1))
     rows, columns, values, count = [], [], [], 0
     for node in range(len(x)):
-        if node in seen:
+        orbit = sorted({int(image[node]) for image in images if image[node] >= 0})
+        if node != orbit[0]:
             continue
-        orbit = sorted({int(image[node]) for image in images})
-        seen.update(orbit)
-        moves = np.zeros((3 * len(orbit), 3))
+        moves = np.zeros((len(orbit), 3, 3))
         for g, image in zip(group, images, strict=True):
-            at = 3 * orbit.index(int(image[node]))
-            moves[at : at + 3] += g
-        U, s, _ = np.linalg.svd(moves, full_matrices=False)
+            if image[node] >= 0:
+                moves[orbit.index(int(image[node]))] += g
+        U, s, _ = np.linalg.svd(moves.reshape(-1, 3), full_matrices=False)
         for vector in U.T[s > 1.0e-9]:
             rows.append((3 * np.array(orbit)[:, None] + np.arange(3)).ravel())
             columns.append(np.full(len(vector), count))
@@ -159,6 +160,16 @@ def symmetric(x: Array, group: Sequence[Array]) -> sparse.csr_matrix:
             count += 1
     entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
     return sparse.csr_matrix(entries, (x.size, count))
+
+
+def solid(x: Array, corners: Ints) -> Callable[[Array], tuple[Array, sparse.csr_matrix]]:
+    """Return what gives forces and their derivative at displacements, of nodes (N, 3) and elements (M, 8)."""
+    gradient, weight, _values = integrate(x, corners)
+    matrix = np.zeros((len(weight), 9, 24))
+    for i in range(3):
+        for j in range(3):
+            matrix[:, 3 * i + j, i::3] = gradient[:, :, j]
+    return elastic(matrix, weight, (3 * corners[:, :, None] + np.arange(3)).reshape(len(corners), -1), x.size, 0.3)
 
 
 def press(x: Array, corners: Ints, moves: sparse.csr_matrix, tops: Sequence[Top]) -> Array:
@@ -170,22 +181,11 @@ def press(x: Array, corners: Ints, moves: sparse.csr_matrix, tops: Sequence[Top]
         moves: Motions that are solved for, shape (3 N, unknowns).
         tops: What may be touched, and by what.
     """
-    gradient, weight, _values = integrate(x, corners)
-    matrix = np.zeros((len(weight), 9, 24))
-    for i in range(3):
-        for j in range(3):
-            matrix[:, 3 * i + j, i::3] = gradient[:, :, j]
-    own = (3 * corners[:, :, None] + np.arange(3)).reshape(len(corners), -1)
-    dofs, rows, columns = np.tile(own, (8, 1)), np.repeat(own, 24, axis=1).ravel(), np.tile(own, (1, 24)).ravel()
-    u, forces = np.zeros(x.size), []
+    elasticity, u, forces = solid(x, corners), np.zeros(x.size), []
     for depth in DEPTHS:
         force = np.zeros(3)
         for _ in range(80):
-            F = (np.einsum("eij,ej->ei", matrix, u[dofs]) + np.eye(3).ravel()).reshape(-1, 3, 3)
-            P, tangent = stress(F, 0.3)
-            residual = np.bincount(dofs.ravel(), np.einsum("eij,ei,e->ej", matrix, P, weight).ravel(), x.size)
-            blocks = matrix.swapaxes(1, 2) @ (tangent * weight[:, None, None]) @ matrix
-            H = sparse.csr_matrix((blocks.reshape(8, -1, 24, 24).sum(axis=0).ravel(), (rows, columns)), (x.size,) * 2)
+            residual, H = elasticity(u)
             for k, (nodes, area, faces) in enumerate(tops):
                 normals, offsets = faces(depth)
                 above = (x + u.reshape(x.shape))[nodes] @ normals.T - offsets

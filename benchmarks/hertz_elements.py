@@ -8,6 +8,7 @@ over Hertz's on two meshes. Edges and corners: `edge_elements`.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,6 +93,33 @@ def stress(F: Array, ratio: float) -> tuple[Array, Array]:
     return (m * (1.0 - more) * F + pressure * cofactor).reshape(n, 9), tangent + pressure * by_F
 
 
+def elastic(
+    matrix: Array, weight: Array, own: Ints, size: int, ratio: float
+) -> Callable[[Array], tuple[Array, sparse.csr_matrix]]:
+    """Return what gives the elastic forces and their derivative at displacements (size,).
+
+    Args:
+        matrix: F of the points by the displacements of their elements, shape (P, 9, K), points before elements.
+        weight: Volumes of the points.
+        own: Displacements of the elements, shape (M, K).
+        size: Number of displacements.
+        ratio: Poisson's ratio.
+    """
+    count, each = own.shape
+    dofs = np.tile(own, (len(weight) // count, 1))
+    rows, columns = np.repeat(own, each, axis=1).ravel(), np.tile(own, (1, each)).ravel()
+
+    def at(u: Array) -> tuple[Array, sparse.csr_matrix]:
+        F = (np.einsum("eij,ej->ei", matrix, u[dofs]) + np.eye(3).ravel()).reshape(-1, 3, 3)
+        P, tangent = stress(F, ratio)
+        blocks = matrix.swapaxes(1, 2) @ (tangent * weight[:, None, None]) @ matrix
+        H = sparse.csr_matrix((blocks.reshape(-1, count, each, each).sum(axis=0).ravel(), (rows, columns)), (size,) * 2)
+        forces = np.einsum("eij,ei,e->ej", matrix, P, weight)
+        return np.asarray(np.bincount(dofs.ravel(), forces.ravel(), size), dtype=float), H
+
+    return at
+
+
 def press(
     matrix: Array,
     weight: Array,
@@ -104,18 +132,13 @@ def press(
 ) -> list[float]:
     """Press a plate onto the top and return its forces [E R^2] at some depths."""
     top, stiffness = surface[0].astype(int), 1.0e3 * surface[1]
-    dofs = np.tile((2 * corners[:, :, None] + np.arange(2)).reshape(len(corners), -1), (4, 1))
-    rows, columns = np.repeat(dofs, dofs.shape[1], axis=1).ravel(), np.tile(dofs, (1, dofs.shape[1])).ravel()
+    inside = elastic(matrix, weight, (2 * corners[:, :, None] + np.arange(2)).reshape(len(corners), -1), x.size, ratio)
     u, free, forces = np.zeros(x.size), np.flatnonzero(~held.ravel()), []
     at = 2 * top + 1
     for depth in depths:
         force = 0.0
         for _ in range(60):
-            F = (np.einsum("eij,ej->ei", matrix, u[dofs]) + np.eye(3).ravel()).reshape(-1, 3, 3)
-            P, tangent = stress(F, ratio)
-            gradient = np.bincount(dofs.ravel(), np.einsum("eij,ei,e->ej", matrix, P, weight).ravel(), x.size)
-            blocks = matrix.swapaxes(1, 2) @ (tangent * weight[:, None, None]) @ matrix
-            H = sparse.csr_matrix((blocks.ravel(), (rows, columns)), (x.size, x.size))
+            gradient, H = inside(u)
             gap = x[top, 1] + u[at] - (1.0 - depth)
             touching = stiffness * (gap > 0.0)
             gradient += np.bincount(at, touching * gap, x.size)

@@ -18,10 +18,9 @@ import argparse
 import numpy as np
 from scipy import sparse
 from scipy.sparse import linalg
-from scipy.spatial import KDTree
 
-from benchmarks.edge_elements import CAP, face, grid
-from benchmarks.hertz_elements import Array, Mask, integrate, stress
+from benchmarks.edge_elements import CAP, face, grid, solid, symmetric
+from benchmarks.hertz_elements import Array, Mask
 from benchmarks.torsion import MU, NU, lubkin
 
 HALF, RADIUS = 1.0 / 6.0, 1.0 / 3.0
@@ -130,55 +129,16 @@ def lines(kind: str, depth: float) -> tuple[Array, Array, Array]:
     return x, x, 0.5 - towards(0.5, 8, fine)[::-1]
 
 
-def alike(x: Array) -> sparse.csr_matrix:
-    """Return the motions of an eighth that are the same under the group, whose images may lie outside of it."""
-    tree, images = KDTree(x), []
-    for g in GROUP:
-        distance, image = tree.query(x @ g.T)
-        images.append(np.where(distance < 1.0e-9, image, -1))
-    rows, columns, values, count = [], [], [], 0
-    for node in range(len(x)):
-        orbit = sorted({int(image[node]) for image in images if image[node] >= 0})
-        if node != orbit[0]:
-            continue
-        moves = np.zeros((len(orbit), 3, 3))
-        for g, image in zip(GROUP, images, strict=True):
-            if image[node] >= 0:
-                moves[orbit.index(int(image[node]))] += g
-        U, s, _ = np.linalg.svd(moves.reshape(-1, 3), full_matrices=False)
-        for vector in U.T[s > 1.0e-9]:
-            rows.append((3 * np.array(orbit)[:, None] + np.arange(3)).ravel())
-            columns.append(np.full(len(vector), count))
-            values.append(vector)
-            count += 1
-    entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
-    return sparse.csr_matrix(entries, (x.size, count))
-
-
 def twisted(kind: str, depth: float) -> tuple[float, list[float]]:
     """Press a finger in by a depth and turn it; return its force and its torque at the twists."""
     parts = lines(kind, depth)
     x, index, corners = grid(parts)
-    moves = alike(x)
+    moves = symmetric(x, GROUP)
     nodes, area = face(index, parts, 2, -1)
     finger = Finger(kind, x[nodes], area)
-    gradient, weight, _values = integrate(x, corners)
-    matrix = np.zeros((len(weight), 9, 24))
-    for i in range(3):
-        for j in range(3):
-            matrix[:, 3 * i + j, i::3] = gradient[:, :, j]
-    own = (3 * corners[:, :, None] + np.arange(3)).reshape(len(corners), -1)
-    dofs, rows, columns = np.tile(own, (8, 1)), np.repeat(own, 24, axis=1).ravel(), np.tile(own, (1, 24)).ravel()
+    inside = solid(x, corners)
     at = 3 * nodes[:, None] + np.arange(3)
     u = np.zeros(x.size)
-
-    def inside() -> tuple[Array, sparse.csr_matrix]:
-        F = (np.einsum("eij,ej->ei", matrix, u[dofs]) + np.eye(3).ravel()).reshape(-1, 3, 3)
-        P, tangent = stress(F, NU)
-        blocks = matrix.swapaxes(1, 2) @ (tangent * weight[:, None, None]) @ matrix
-        H = sparse.csr_matrix((blocks.reshape(8, -1, 24, 24).sum(axis=0).ravel(), (rows, columns)), (x.size,) * 2)
-        forces = np.einsum("eij,ei,e->ej", matrix, P, weight)
-        return np.asarray(np.bincount(dofs.ravel(), forces.ravel(), x.size), dtype=float), H
 
     def top() -> Array:
         return (x + u.reshape(x.shape))[nodes]
@@ -188,7 +148,7 @@ def twisted(kind: str, depth: float) -> tuple[float, list[float]]:
         finger.move(top(), depth * (k + 1) / count, 0.0)
         for turn in range(40):
             force, slope = finger.press(top(), exact=turn > 6)
-            residual, H = inside()
+            residual, H = inside(u)
             residual -= np.bincount(at.ravel(), force.ravel(), x.size)
             entries = (slope.ravel(), (np.repeat(at, 3, 1).ravel(), np.tile(at, (1, 3)).ravel()))
             H = (moves.T @ (H + sparse.csr_matrix(entries, H.shape)) @ moves).tocsc()
@@ -205,7 +165,7 @@ def twisted(kind: str, depth: float) -> tuple[float, list[float]]:
     force, _slope = finger.press(start, exact=True)
     near = np.abs(start[:, :2]).max(axis=1) < 0.27
     own_moves = moves[at[near].ravel()]
-    A = (moves.T @ inside()[1] @ moves).tocsc()
+    A = (moves.T @ inside(u)[1] @ moves).tocsc()
     touched = np.unique(own_moves.indices)
     rest = np.setdiff1d(np.arange(A.shape[0]), touched)
     cross = A[rest][:, touched].toarray()
