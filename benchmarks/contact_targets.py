@@ -193,8 +193,8 @@ def two_balls(modulus: float, share: float) -> Figure:
 def grip(name: str) -> Figure:
     """Hold a body between two opening plates: their normal force before it falls, over m g / (2 mu)."""
     body, material = of_task(name)
-    mu, edges = 0.5, np.ptp(body.bounds, axis=0)
-    width, config = float(edges[1]), newton.ModelBuilder.ShapeConfig(mu=0.5)
+    mu, width = 0.5, float(np.ptp(body.bounds[:, 1]))
+    config = newton.ModelBuilder.ShapeConfig(mu=mu)
 
     def populate(world: newton.ModelBuilder) -> None:
         middle = tuple(-body.bounds.mean(axis=0))

@@ -25,7 +25,8 @@ from softmode.scenes import SplatScene
 LENS, NOISE, BLUR, EXPOSURE = gs.Lens(k1=0.08, k2=-0.03, p1=0.001, p2=-0.0008), 0.02, 0.5, 0.1
 """What the lens does; noise of a pixel, blur [px], to which the lens adds as much, and error of the exposure."""
 FOAM = Material(youngs_modulus=2.0e4, poissons_ratio=0.35, density=150.0, viscosity=4.0e-3)
-WALL, SKY = (1.0, 1.0, 1.0), gs.CameraOptions(sky=((1.0, 1.0, 1.0),) * 2)
+WALL = (1.0, 1.0, 1.0)
+SKY = gs.CameraOptions(sky=(WALL,) * 2)
 
 
 def views(splats, z: np.ndarray, turn: float, edge: int, fov: float) -> list[gs.PinholeCamera]:
@@ -40,8 +41,7 @@ def views(splats, z: np.ndarray, turn: float, edge: int, fov: float) -> list[gs.
 
 def pictures(splats, cameras: list[gs.PinholeCamera]) -> np.ndarray:
     """Return clean pictures before the wall, shape (V, height, width, 3)."""
-    first = cameras[0]
-    raster = gs.SplatRasterizer(splats.count, len(cameras), first.width, first.height)
+    raster = gs.SplatRasterizer(splats.count, len(cameras), cameras[0].width, cameras[0].height)
     seen = gs.ViewArrays.from_cameras(cameras, world=[0] * len(cameras))
     raster.render(gs.SplatArrays.from_splats([splats]), seen)
     return raster.rgb.numpy() + (1.0 - raster.alpha.numpy()[..., None]) * np.array(WALL)

@@ -23,7 +23,7 @@ class RadianceInfo:
         """Print nodes, degree, box, densities and what solid they show."""
         import numpy as np
 
-        from softmode.deformables.quadrature.quadrature_density import ALLOWED, DOUBTED, FOGGY, quadrature_from_density
+        from softmode.deformables.quadrature.quadrature_density import FOGGY, is_doubtful, quadrature_from_density
         from softmode.radiance.formats import read_radiance
 
         with quiet_warp():
@@ -53,7 +53,7 @@ class RadianceInfo:
         patch, allowed = field.contradicted or 0.0, field.allowed or 0.0
         if field.allowed is not None:
             print(f"pictures    contradict a patch of {patch:.1%} of its surface, allow {allowed:.2g} times its volume")
-        if patch > DOUBTED or allowed > ALLOWED:
+        if is_doubtful(patch, allowed):
             print("            the solid is doubtful: cavities may be full, or their walls too thick")
         return 0
 

@@ -218,10 +218,10 @@ class _Run:
                 fits = {k: v.shape for k, v in module.state_dict().items()} == {k: v.shape for k, v in arrays.items()}
                 if fits or name == "actor" or options.resume:  # else a critic of another kind, which starts anew
                     module.load_state_dict(arrays, strict=True)
-            if not options.resume and "initial_std" in options.overrides:
-                self.model.actor.log_std.data.fill_(math.log(self.hyperparameters.initial_std))
             if options.resume:
                 self.ppo.optimizer.load({k: torch.from_numpy(a) for k, a in start.part("optimizer").items()})
+            elif "initial_std" in options.overrides:
+                self.model.actor.log_std.data.fill_(math.log(self.hyperparameters.initial_std))
         except (RuntimeError, ValueError) as error:
             raise CheckpointError(
                 f"checkpoint {path} holds other networks than this run ({error})",

@@ -50,6 +50,11 @@ DARTS, ROUNDS = 8, 12
 """Darts per wanted disk in a round, and rounds; the last one finds a place for one disk in a hundred."""
 
 
+def is_doubtful(contradicted: float, allowed: float) -> bool:
+    """Return whether a trained solid is doubtful, by what its pictures contradict and allow (`RadianceGrid`)."""
+    return contradicted > DOUBTED or allowed > ALLOWED
+
+
 def quadrature_from_density(
     sigma: Density,
     bounds: ArrayLike,

@@ -17,7 +17,7 @@ from scipy.spatial import ConvexHull, QhullError
 from softmode.checks import require_number
 from softmode.deformables.quadrature.interior import Interior, interior_from_quadrature, interior_from_surface
 from softmode.deformables.quadrature.occupancy import KEPT_EXTENT, KEPT_SHARE
-from softmode.deformables.quadrature.quadrature_density import ALLOWED, DOUBTED, FOGGY
+from softmode.deformables.quadrature.quadrature_density import FOGGY, is_doubtful
 from softmode.deformables.reduction.basis import KERNEL_POINTS
 from softmode.deformables.reduction.cubature import POISSON_RATIO
 from softmode.deformables.reduction.elastic_functions import EXCESS, EXCESS_WARNING
@@ -550,7 +550,7 @@ def _check_asset(body: ReducedBody, told: dict[str, float], notes: _Notes) -> No
             "train it with opaque walls (examples/train_field.py), or build from a mesh of the object",
         )
     patch, allowed = told.get("quadrature_contradicted", 0.0), told.get("quadrature_allowed", 0.0)
-    if patch > DOUBTED or allowed > ALLOWED:
+    if is_doubtful(patch, allowed):
         notes.find(
             "warning",
             "doubtful solid",
