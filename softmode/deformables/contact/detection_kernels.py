@@ -20,6 +20,7 @@ from softmode.deformables.contact.cell_kernels import (
     touched_share,
     write_row,
 )
+from softmode.deformables.contact.face_kernels import face_on_cell, near_rim
 from softmode.deformables.contact.penalty_kernels import (
     BULK_FACTOR,
     HARDENING_DEPTH,
@@ -241,9 +242,8 @@ def march(
     """Return gap and normal of the half-space that stands for a shape along a way from ``x``, in the shape's frame.
 
     The way is marched by distances to the shape grown by ``thick``. To the body's inside (``back``), for a sample past
-    the middle of a thin plate, through it, or beside the flank of a box: where the way leaves the shape, else what is
-    ``nearest`` to x. The way of a fast sample: where it first meets the shape, or else passes nearest, with no
-    ``onset`` of its contact.
+    the middle of a thin plate or through it: where the way leaves the shape, else what is ``nearest`` to x. The way of a
+    fast sample: where it first meets the shape, or else passes nearest, with no ``onset`` of its contact.
     """
     kind = shapes.kind[shape]
     scale = shapes.scale[shape]
@@ -330,6 +330,45 @@ def ridge_of(
     return length, depth, inward
 
 
+@wp.func
+def face_of(
+    instances: Instances,
+    basis: Basis,
+    motion: Motion,
+    shapes: Shapes,
+    samples: Samples,
+    i: int,
+    row: int,
+    shape: int,
+):
+    """Return the gap to the face of a box whose rim is in a cell [m], its normal, the share of the cell under it, where.
+
+    The gap is that of the sample to the plane of the face, huge where there is none; where is the middle of the part
+    from the sample, at rest [m].
+    """
+    origin, rotation = shape_frame(shapes, shape)
+    x = wp.quat_rotate_inv(rotation, samples.position[i, row - instances.row_start[i]] - origin)
+    half = wp.vec3d(shapes.scale[shape] + wp.vec3(shapes.margin[shape] + instances.contact_radius[i]))
+    side = wp.float64(instances.scale[i] * wp.sqrt(basis.row_area[row]))
+    gap = wp.float64(1.0e30)
+    normal = wp.vec3d()
+    share = wp.float64(1.0)
+    middle = wp.vec3d()
+    if near_rim(half, x, side):
+        back = wp.inverse(gradient_of(instances, basis, motion.q_start, i, row))
+        N = wp.vec3d(basis.row_normal[row])
+        inward = -wp.quat_rotate_inv(rotation, wp.normalize(wp.transpose(back) * N))
+        axis, part, local = face_on_cell(half, x, inward, side)
+        if axis >= 0:
+            gap = wp.abs(x[axis]) - half[axis]
+            normal[axis] = wp.where(x[axis] < wp.float64(0.0), wp.float64(-1.0), wp.float64(1.0))
+            normal = wp.quat_rotate(rotation, normal)
+            share = part
+            middle = back * wp.quat_rotate(rotation, local)
+            middle -= wp.dot(middle, N) * N
+    return gap, normal, share, middle
+
+
 @wp.kernel(launch_bounds=(256, 2))
 def find_contacts(
     instances: Instances,
@@ -386,6 +425,13 @@ def find_contacts(
         if kind == HEIGHTFIELD:
             query = query_heightfield(local, shapes.fields, shapes.fields.index[shape], far)
         query.distance -= thick
+        level = bool(False)
+        if kind == BOX and query.distance < wp.max(reach, REACH * side):
+            deep, facing, _share, _middle = face_of(instances, basis, motion, shapes, samples, i, row, shape)
+            if deep > -wp.float64(0.3 * OVERLAP * instances.size[i]) and deep < wp.float64(reach):
+                level = bool(True)
+                query.distance = float(deep)
+                query.normal = wp.quat_rotate_inv(turn, wp.vec3(facing))
         # In general the half-space at the nearest point stands for the shape during the step, but
         along = wp.vec3()
         end = float(0.0)
@@ -393,7 +439,7 @@ def find_contacts(
         depth = instances.scale[i] * float(wp.length(basis.inner_point[row]))
         travel = wp.length(drift)
         touched = stuck[0] == shape or stuck[1] == shape or dt_before[i] == wp.float64(0.0)
-        if query.distance <= 0.0 or (touched and query.distance < 2.0 * depth):
+        if not level and (query.distance <= 0.0 or (touched and query.distance < 2.0 * depth)):
             bent = interpolate(basis.inner_row, row, motion.q_start, i, instances.function_count[i])
             inner = wp.quat_rotate_inv(turn, wp.vec3(basis.inner_point[row] + bent))
             depth = wp.length(inner)
@@ -402,11 +448,6 @@ def find_contacts(
                 # the nearest surface faces away from the body's inside: the sample must go back to it
                 along = inner / depth
                 end = 2.0 * depth
-                back = 1
-            elif kind == BOX and query.distance <= 0.0 and wp.dot(query.normal, inner) < OPPOSED * depth:
-                # beside a flank, under the rim of a finger: not aside, from as deep as contact with edges dents
-                along = inner / depth
-                end = 0.3 * OVERLAP * instances.size[i]
                 back = 1
         if end == 0.0 and query.distance > 0.0 and travel > instances.margin[i] and travel > query.distance:
             # a half-space at the start would also stop fast samples that fly past a small shape
@@ -634,6 +675,14 @@ def gather_contacts(
         # of unit length in float64: what is left of the gap in the slip must not count against the stick range
         normal = wp.normalize(wp.vec3d(samples.normal[i, s, slot]))
         cell_shape = shape_of_cell(surface, instances, basis, i, row, curvature_of(shapes, shape, normal))
+        part = wp.float64(1.0)
+        middle = wp.vec3d()
+        if shapes.kind[shape] == BOX:
+            level, facing, under, place = face_of(instances, basis, motion, shapes, samples, i, row, shape)
+            near = wp.abs(level - samples.gap[i, s, slot]) < wp.float64(1.0e-6)
+            if near and wp.dot(facing, normal) > wp.float64(0.999):
+                part = under
+                middle = place
         start = wp.mat33d()
         ahead = wp.mat33d()
         closing = wp.float64(0.0)
@@ -642,8 +691,12 @@ def gather_contacts(
             start, ahead, closing = motion_of_cell(instances, basis, motion, shapes, samples, i, row, shape, normal, dt)
             fade = fade_of(cell_shape, ahead, normal)
             touched = touched_share(surface, samples.shape, samples.gap, cell_shape, fade, i, row, shape)
+            gap += wp.dot(normal, start * middle)
+            closing += wp.dot(normal, (ahead - start) * middle)
+        cell_shape.bend *= part
+        cell_shape.width *= wp.sqrt(part)
         spared = float(wp.float64(1.0) - touched * touched)
-        area = wp.max(sample_area(instances.scale[i], basis.row_area[row]), 1.0e-30)
+        area = wp.max(float(part) * sample_area(instances.scale[i], basis.row_area[row]), 1.0e-30)
         relative = surface.relative_stiffness[row]
         partner_mass = float(0.0)
         if shapes.body[shape] >= 0 and prescribed == 0:
@@ -661,6 +714,7 @@ def gather_contacts(
         ratio = stiffness * compliance * wp.float64(share * share)
         cell = cell_at(cell_shape, ahead, normal, gap, closing, ratio)
         turned = wp.dot(normal, (ahead - start) * cell.centre)
+        cell.centre += middle
         ridge = wp.float64(0.0)
         ridge_lead = wp.float64(0.0)
         if shapes.kind[shape] == BOX:
