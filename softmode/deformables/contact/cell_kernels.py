@@ -171,6 +171,20 @@ def cell_at(shape: CellShape, F: wp.mat33d, n: wp.vec3d, gap: wp.float64, closin
 
 
 @wp.func
+def part_of_cell(shape: CellShape, part: wp.float64):
+    """Return a cell of which a part is under a face."""
+    cut = CellShape()
+    cut.normal = shape.normal
+    cut.width = wp.sqrt(part) * shape.width
+    cut.bend = part * shape.bend
+    cut.least = shape.least
+    cut.steepest = shape.steepest
+    cut.fade = shape.fade
+    cut.poissons_ratio = shape.poissons_ratio
+    return cut
+
+
+@wp.func
 def gradient_of(instances: Instances, basis: Basis, q: wp.array2d[vec8d], i: int, row: int):
     """Return the deformation gradient F of an instance at a surface sample."""
     G = displacement_gradient(basis.row_gradient, q, i, row, instances.function_count[i])
@@ -196,6 +210,7 @@ def touched_share(
     surface: Surface,
     found: wp.array3d[int],  # (instance_count, sample_max, SLOTS), what is touched
     gap: wp.array3d[wp.float64],  # likewise [m]
+    part: wp.array3d[float],  # likewise, of the cell what lies under it; of one entry: all
     shape: CellShape,
     fade: wp.float64,
     i: int,
@@ -208,7 +223,10 @@ def touched_share(
         t = surface.neighbour[k]
         for slot in range(SLOTS):
             if found[i, t, slot] == other:
-                carried += wp.float64(surface.weight[k]) * touching(neighbour_at(shape, fade, gap[i, t, slot]))
+                weight = wp.float64(surface.weight[k])
+                if part.shape[1] > 1:
+                    weight *= wp.float64(part[i, t, slot])
+                carried += weight * touching(neighbour_at(shape, fade, gap[i, t, slot]))
     return carried
 
 

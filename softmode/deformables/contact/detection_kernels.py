@@ -16,6 +16,7 @@ from softmode.deformables.contact.cell_kernels import (
     cell_at,
     fade_of,
     gradient_of,
+    part_of_cell,
     shape_of_cell,
     touched_share,
     write_row,
@@ -330,43 +331,41 @@ def ridge_of(
     return length, depth, inward
 
 
-@wp.func
-def face_of(
-    instances: Instances,
-    basis: Basis,
-    motion: Motion,
-    shapes: Shapes,
-    samples: Samples,
-    i: int,
-    row: int,
-    shape: int,
-):
-    """Return the gap to the face of a box whose rim is in a cell [m], its normal, the share of the cell under it, where.
+@struct
+class BoxFace:
+    """Where the cell of a sample stands to a box."""
 
-    The gap is that of the sample to the plane of the face, huge where there is none; where is the middle of the part
-    from the sample, at rest [m].
-    """
+    half: wp.vec3d  # extents [m]
+    rotation: wp.quatd
+    x: wp.vec3d  # the sample in its frame [m]
+    side: wp.float64  # of the cell [m]
+    normal: wp.vec3d  # of the cell at rest, outward
+
+
+@wp.func
+def box_beside(instances: Instances, basis: Basis, shapes: Shapes, samples: Samples, i: int, row: int, shape: int):
+    """Return where the cell of a sample stands to a box."""
     origin, rotation = shape_frame(shapes, shape)
-    x = wp.quat_rotate_inv(rotation, samples.position[i, row - instances.row_start[i]] - origin)
-    half = wp.vec3d(shapes.scale[shape] + wp.vec3(shapes.margin[shape] + instances.contact_radius[i]))
-    side = wp.float64(instances.scale[i] * wp.sqrt(basis.row_area[row]))
-    gap = wp.float64(1.0e30)
-    normal = wp.vec3d()
-    share = wp.float64(1.0)
-    middle = wp.vec3d()
-    if near_rim(half, x, side):
-        back = wp.inverse(gradient_of(instances, basis, motion.q_start, i, row))
-        N = wp.vec3d(basis.row_normal[row])
-        inward = -wp.quat_rotate_inv(rotation, wp.normalize(wp.transpose(back) * N))
-        axis, part, local = face_on_cell(half, x, inward, side)
-        if axis >= 0:
-            gap = wp.abs(x[axis]) - half[axis]
-            normal[axis] = wp.where(x[axis] < wp.float64(0.0), wp.float64(-1.0), wp.float64(1.0))
-            normal = wp.quat_rotate(rotation, normal)
-            share = part
-            middle = back * wp.quat_rotate(rotation, local)
-            middle -= wp.dot(middle, N) * N
-    return gap, normal, share, middle
+    box = BoxFace()
+    box.half = wp.vec3d(shapes.scale[shape] + wp.vec3(shapes.margin[shape] + instances.contact_radius[i]))
+    box.rotation = rotation
+    box.x = wp.quat_rotate_inv(rotation, samples.position[i, row - instances.row_start[i]] - origin)
+    box.side = wp.float64(instances.scale[i] * wp.sqrt(basis.row_area[row]))
+    box.normal = wp.vec3d(basis.row_normal[row])
+    return box
+
+
+@wp.func
+def face_part(box: BoxFace, F: wp.mat33d):
+    """Return the axis of the face that a cell of gradient F lies on, its part under it, and its middle at rest [m].
+
+    As ``face_on_cell``; the middle is from the sample.
+    """
+    back = wp.inverse(F)
+    inward = -wp.quat_rotate_inv(box.rotation, wp.normalize(wp.transpose(back) * box.normal))
+    axis, part, local = face_on_cell(box.half, box.x, inward, box.side)
+    middle = back * wp.quat_rotate(box.rotation, local)
+    return axis, part, middle - wp.dot(middle, box.normal) * box.normal
 
 
 @wp.kernel(launch_bounds=(256, 2))
@@ -425,13 +424,19 @@ def find_contacts(
         if kind == HEIGHTFIELD:
             query = query_heightfield(local, shapes.fields, shapes.fields.index[shape], far)
         query.distance -= thick
-        level = bool(False)
+        part = float(1.0)
         if kind == BOX and query.distance < wp.max(reach, REACH * side):
-            deep, facing, _share, _middle = face_of(instances, basis, motion, shapes, samples, i, row, shape)
-            if deep > -wp.float64(0.3 * OVERLAP * instances.size[i]) and deep < wp.float64(reach):
-                level = bool(True)
-                query.distance = float(deep)
-                query.normal = wp.quat_rotate_inv(turn, wp.vec3(facing))
+            box = box_beside(instances, basis, shapes, samples, i, row, shape)
+            if near_rim(box.half, box.x, box.side):
+                axis, under, _middle = face_part(box, gradient_of(instances, basis, motion.q_start, i, row))
+                level = float(0.0)
+                if axis >= 0:
+                    level = float(wp.abs(box.x[axis]) - box.half[axis])
+                if axis >= 0 and level > -0.3 * OVERLAP * instances.size[i] and level < reach:
+                    part = float(under)
+                    query.distance = level
+                    query.normal = wp.vec3()
+                    query.normal[axis] = wp.where(box.x[axis] < wp.float64(0.0), -1.0, 1.0)
         # In general the half-space at the nearest point stands for the shape during the step, but
         along = wp.vec3()
         end = float(0.0)
@@ -439,7 +444,7 @@ def find_contacts(
         depth = instances.scale[i] * float(wp.length(basis.inner_point[row]))
         travel = wp.length(drift)
         touched = stuck[0] == shape or stuck[1] == shape or dt_before[i] == wp.float64(0.0)
-        if not level and (query.distance <= 0.0 or (touched and query.distance < 2.0 * depth)):
+        if part == 1.0 and (query.distance <= 0.0 or (touched and query.distance < 2.0 * depth)):
             bent = interpolate(basis.inner_row, row, motion.q_start, i, instances.function_count[i])
             inner = wp.quat_rotate_inv(turn, wp.vec3(basis.inner_point[row] + bent))
             depth = wp.length(inner)
@@ -470,10 +475,12 @@ def find_contacts(
                 samples.shape[i, s, 1] = samples.shape[i, s, 0]
                 samples.gap[i, s, 1] = samples.gap[i, s, 0]
                 samples.normal[i, s, 1] = samples.normal[i, s, 0]
+                samples.part[i, s, 1] = samples.part[i, s, 0]
                 slot = 0
             samples.shape[i, s, slot] = shape
             samples.gap[i, s, slot] = gap
             samples.normal[i, s, slot] = normal
+            samples.part[i, s, slot] = part
 
 
 @wp.func
@@ -675,26 +682,23 @@ def gather_contacts(
         # of unit length in float64: what is left of the gap in the slip must not count against the stick range
         normal = wp.normalize(wp.vec3d(samples.normal[i, s, slot]))
         cell_shape = shape_of_cell(surface, instances, basis, i, row, curvature_of(shapes, shape, normal))
-        part = wp.float64(1.0)
-        middle = wp.vec3d()
-        if shapes.kind[shape] == BOX:
-            level, facing, under, place = face_of(instances, basis, motion, shapes, samples, i, row, shape)
-            near = wp.abs(level - samples.gap[i, s, slot]) < wp.float64(1.0e-6)
-            if near and wp.dot(facing, normal) > wp.float64(0.999):
-                part = under
-                middle = place
+        part = wp.float64(samples.part[i, s, slot])
         start = wp.mat33d()
         ahead = wp.mat33d()
         closing = wp.float64(0.0)
         touched = wp.float64(0.0)
-        if gap <= NEAR * cell_shape.steepest:
+        middle = wp.vec3d()
+        beside = gap <= NEAR * cell_shape.steepest
+        if beside or part < wp.float64(1.0):
             start, ahead, closing = motion_of_cell(instances, basis, motion, shapes, samples, i, row, shape, normal, dt)
+        if beside:
             fade = fade_of(cell_shape, ahead, normal)
-            touched = touched_share(surface, samples.shape, samples.gap, cell_shape, fade, i, row, shape)
+            touched = touched_share(surface, samples.shape, samples.gap, samples.part, cell_shape, fade, i, row, shape)
+        if part < wp.float64(1.0):
+            _axis, _part, middle = face_part(box_beside(instances, basis, shapes, samples, i, row, shape), start)
             gap += wp.dot(normal, start * middle)
             closing += wp.dot(normal, (ahead - start) * middle)
-        cell_shape.bend *= part
-        cell_shape.width *= wp.sqrt(part)
+        cell_shape = part_of_cell(cell_shape, part)
         spared = float(wp.float64(1.0) - touched * touched)
         area = wp.max(float(part) * sample_area(instances.scale[i], basis.row_area[row]), 1.0e-30)
         relative = surface.relative_stiffness[row]
@@ -717,7 +721,7 @@ def gather_contacts(
         cell.centre += middle
         ridge = wp.float64(0.0)
         ridge_lead = wp.float64(0.0)
-        if shapes.kind[shape] == BOX:
+        if shapes.kind[shape] == BOX and part == wp.float64(1.0):
             found = float(samples.gap[i, s, slot])
             length, deep, inward = ridge_of(instances, basis, motion, shapes, samples, i, row, shape, found, normal)
             face = cell.lead - gap

@@ -190,7 +190,7 @@ class AdjointReduced:
         self._constraint = {name: self._zeros((step_max, *constraints), kind) for name, kind in kinds.items()}
 
         samples, touched = (step_max, *t.samples.shape.shape), self.solver.model.shape_count > 0
-        kinds = {"shape": int, "gap": wp.float64, "normal": wp.vec3} if touched else {}
+        kinds = {"shape": int, "gap": wp.float64, "normal": wp.vec3, "part": wp.float32} if touched else {}
         self._sample = {name: self._zeros(samples, kind) for name, kind in kinds.items()}
 
         self._sizes = {
@@ -203,7 +203,7 @@ class AdjointReduced:
         }
         of_constraints = (
             "constraint_slip constraint_normal constraint_gain constraint_hessian constraint memory memory_start "
-            "contact_bar normal_bar cell_gradient cell_place cell_spared cell_fade"
+            "contact_bar normal_bar cell_gradient cell_place start_place start_gradient cell_spared cell_fade"
         )
         axes = {"": "instance point", of_constraints: "instance constraint", "sample_place": "instance sample"}
         self._step = allocate(kernels.Linearised, axes, self._sizes, self.device)

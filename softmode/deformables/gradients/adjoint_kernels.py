@@ -64,6 +64,8 @@ class Linearised:
     # and of what the dent along the surface is beside that across
     cell_gradient: wp.array2d[wp.mat33d]  # the loss by the gradient of a cell ahead, and
     cell_place: wp.array2d[wp.vec3d]  # by the sample's place ahead [1/m]
+    start_place: wp.array2d[wp.vec3d]  # the same at the start, by the part of the cell that is under a face [1/m]
+    start_gradient: wp.array2d[wp.mat33d]
     cell_spared: wp.array2d[wp.float64]  # by the share of the neighbourhood that does not touch
     cell_fade: wp.array2d[wp.vec2d]  # gap at which a neighbour begins to count, and over which it comes to count [m]
     sample_place: wp.array2d[wp.vec3d]  # (instance_count, sample_max), the loss by its place at the start [1/m]

@@ -20,11 +20,21 @@ from softmode.deformables.contact.cell_kernels import (
     fade_of,
     gradient_of,
     neighbour_at,
+    part_of_cell,
     shape_of_cell,
     touched_share,
     write_row,
 )
-from softmode.deformables.contact.detection_kernels import Shapes, curvature_of, motion_of_cell, shape_area
+from softmode.deformables.contact.detection_kernels import (
+    BoxFace,
+    Shapes,
+    box_beside,
+    curvature_of,
+    face_part,
+    motion_of_cell,
+    shape_area,
+    shape_frame,
+)
 from softmode.deformables.contact.penalty_kernels import (
     BULK_FACTOR,
     HARDENING,
@@ -48,6 +58,7 @@ from softmode.deformables.model.struct_kernels import (
     Motion,
     PointConstraints,
     Samples,
+    interpolate,
 )
 
 wp.set_module_options({"enable_backward": False})
@@ -78,6 +89,26 @@ def normal_of(instances: Instances, samples: Samples, i: int, sample: int, shape
 
 
 @wp.func
+def part_of(
+    instances: Instances,
+    basis: Basis,
+    shapes: Shapes,
+    samples: Samples,
+    i: int,
+    sample: int,
+    shape: int,
+    F: wp.mat33d,
+):
+    """Return the part of a cell of gradient F that lies under a face of a shape, and its middle at rest [m]."""
+    s = sample - instances.row_start[i]
+    part = wp.float64(samples.part[i, s, slot_of(samples, i, s, shape)])
+    middle = wp.vec3d()
+    if part < wp.float64(1.0):
+        _axis, _part, middle = face_part(box_beside(instances, basis, shapes, samples, i, sample, shape), F)
+    return part, middle
+
+
+@wp.func
 def cell_loss(
     shape: CellShape,
     F: wp.mat33d,
@@ -92,6 +123,13 @@ def cell_loss(
     """Return the loss to first order in what ``cell_at`` returns."""
     cell = cell_at(shape, F, n, gap, closing, ratio)
     return onset_bar * cell.onset + lead_bar * cell.lead + wp.dot(centre_bar, cell.centre)
+
+
+@wp.func
+def part_loss(box: BoxFace, F: wp.mat33d, share_bar: wp.float64, middle_bar: wp.vec3d):
+    """Return the loss to first order in the part of a cell under a face, by its ln, and in the middle of that."""
+    _axis, part, middle = face_part(box, F)
+    return share_bar * wp.log(part) + wp.dot(middle_bar, middle)
 
 
 @wp.func
@@ -166,6 +204,10 @@ def accumulate_cells(
     gap = gap_of(instances, samples, i, row, shape)
     other = curvature_of(shapes, shape, face)
     cell_shape = shape_of_cell(surface, instances, basis, i, row, other)
+    part, middle = part_of(instances, basis, shapes, samples, i, row, shape, start)
+    cut = part_of_cell(cell_shape, part)
+    open_gap = gap + wp.dot(face, start * middle)
+    closing += wp.dot(face, (ahead - start) * middle)
     back = step.contact_bar[i, e]
     along = wp.dot(n, back)
     centre_bar = wp.vec3d()
@@ -173,18 +215,35 @@ def accumulate_cells(
         moved = gradient_of(instances, basis, q, i, row) - start
         pulled = displacement_gradient(basis.row_gradient, costate, i, row, instances.function_count[i])
         centre_bar = wp.transpose(pulled) * constraints.force[i, e] - wp.transpose(moved) * back
-        centre_bar += along * (wp.transpose(ahead - start) * face)
         centre_bar += wp.transpose(start) * turned_back(shapes, shape, back, dt)
+    middle_bar = centre_bar - along * (wp.transpose(start) * face)
+    centre_bar += along * (wp.transpose(ahead - start) * face)
     by_shape, by_F, _by_n, _by_gap, by_place, by_ratio, _o, _l, _c = wp.grad(cell_loss)(
-        cell_shape, ahead, face, gap, closing, ratio, onset_bar, lead_bar, centre_bar
+        cut, ahead, face, open_gap, closing, ratio, onset_bar, lead_bar, centre_bar
     )
     fade_shape, fade_F, _fade_n = wp.grad(fade_of)(cell_shape, ahead, face)
-    cell = cell_at(cell_shape, ahead, face, gap, closing, ratio)
+    cell = cell_at(cut, ahead, face, open_gap, closing, ratio)
+    step.start_place[i, e] = wp.vec3d()
+    step.start_gradient[i, e] = wp.mat33d()
+    by_side = zero
+    if part < wp.float64(1.0):
+        middle_bar += by_place * (wp.transpose(ahead) * face)
+        by_F += by_place * wp.outer(face, middle)
+        pressed = interpolate(basis.row, constraints.row[i, e], costate, i, instances.function_count[i])
+        share_bar = wp.dot(pressed, constraints.force[i, e])
+        share_bar += by_shape.bend * cut.bend + half * by_shape.width * cut.width
+        by_box, by_start, _by_share, _by_middle = wp.grad(part_loss)(
+            box_beside(instances, basis, shapes, samples, i, row, shape), start, share_bar, middle_bar
+        )
+        _origin, rotation = shape_frame(shapes, shape)
+        step.start_place[i, e] = wp.quat_rotate(rotation, by_box.x)
+        step.start_gradient[i, e] = by_start
+        by_side = by_box.side * wp.float64(instances.scale[i] * wp.sqrt(basis.row_area[row]))
     fade = fade_of(cell_shape, ahead, face)
     touched = zero
     spared = zero  # or one, far away: either does not change
     if gap <= NEAR * cell_shape.steepest:
-        touched = touched_share(surface, samples.shape, samples.gap, cell_shape, fade, i, row, shape)
+        touched = touched_share(surface, samples.shape, samples.gap, samples.part, cell_shape, fade, i, row, shape)
         spared = wp.float64(1.0) - touched * touched
     by_gap = zero
     by_fade = zero
@@ -193,7 +252,7 @@ def accumulate_cells(
         for slot in range(SLOTS):
             if samples.shape[i, t, slot] == shape:
                 y = neighbour_at(cell_shape, fade, samples.gap[i, t, slot])
-                change = wp.float64(surface.weight[m]) * slope_of_touching(y) / fade
+                change = wp.float64(surface.weight[m] * samples.part[i, t, slot]) * slope_of_touching(y) / fade
                 by_gap += change
                 by_fade -= (wp.float64(1.0) - y) * change
 
@@ -213,8 +272,8 @@ def accumulate_cells(
 
     # lengths grow with the scale, but not the radius of what is touched
     above = half * spared_bar * by_gap
-    bend_bar = by_shape.bend + fade_bar * fade_shape.bend + above
-    by_scale = depth_bar + fade_bar * fade_shape.fade * cell_shape.fade
+    bend_bar = part * by_shape.bend + fade_bar * fade_shape.bend + above
+    by_scale = depth_bar + fade_bar * fade_shape.fade * cell_shape.fade + by_side
     by_scale += (by_shape.steepest + fade_bar * fade_shape.steepest) * cell_shape.steepest
     by_scale += (by_shape.least - above) * cell_shape.least
     if cell_shape.bend > zero:
@@ -246,11 +305,14 @@ def restore_rows(
         return
     shape = constraints.shape[i, e]
     n = normal_of(instances, samples, i, row, shape)
-    _start, ahead, closing = motion_of_cell(instances, basis, motion, shapes, samples, i, row, shape, n, dt)
+    start, ahead, closing = motion_of_cell(instances, basis, motion, shapes, samples, i, row, shape, n, dt)
     cell_shape = shape_of_cell(surface, instances, basis, i, row, curvature_of(shapes, shape, n))
+    part, middle = part_of(instances, basis, shapes, samples, i, row, shape, start)
+    gap = gap_of(instances, samples, i, row, shape) + wp.dot(n, start * middle)
+    closing += wp.dot(n, (ahead - start) * middle)
     ratio = constraints.stiffness[i, e] * constraints.dent_compliance[i, e]
-    cell = cell_at(cell_shape, ahead, n, gap_of(instances, samples, i, row, shape), closing, ratio)
-    write_row(basis, constraints.row[i, e], row, cell.centre)
+    cell = cell_at(part_of_cell(cell_shape, part), ahead, n, gap, closing, ratio)
+    write_row(basis, constraints.row[i, e], row, cell.centre + middle)
 
 
 @wp.kernel
@@ -275,7 +337,8 @@ def spread_over_neighbours(
             for slot in range(SLOTS):
                 if samples.shape[i, t, slot] == constraints.shape[i, e]:
                     y = (step.cell_fade[i, e][0] - samples.gap[i, t, slot]) / step.cell_fade[i, e][1]
-                    change = wp.float64(surface.weight[m]) * step.cell_spared[i, e] * slope_of_touching(y)
+                    weight = wp.float64(surface.weight[m] * samples.part[i, t, slot])
+                    change = weight * step.cell_spared[i, e] * slope_of_touching(y)
                     pull = change / step.cell_fade[i, e][1] * constraints.normal[i, e]
                     step.sample_place[i, t] = step.sample_place[i, t] + pull
 
@@ -303,6 +366,11 @@ def propagate_cells(
         for j in range(3):
             ahead = ahead + step.cell_gradient[i, k][axis, j] * vec8d(basis.row_gradient[b, row, j])
     start = vec8d()
+    for k in range(instances.pin_count[i], constraints.count[i]):
+        row = constraints.partner_row[i, k]
+        start = start + step.start_place[i, k][axis] * vec8d(basis.row[row, b])
+        for j in range(3):
+            start = start + step.start_gradient[i, k][axis, j] * vec8d(basis.row_gradient[b, row, j])
     for s in range(instances.sample_count[i]):
         start = start + step.sample_place[i, s][axis] * vec8d(basis.row[instances.row_start[i] + s, b])
     q_bar[i, e] = q_bar[i, e] + ahead + start
