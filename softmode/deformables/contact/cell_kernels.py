@@ -175,7 +175,8 @@ def part_of_cell(shape: CellShape, part: wp.float64):
     """Return a cell of which a part is under a face."""
     cut = CellShape()
     cut.normal = shape.normal
-    cut.width = wp.sqrt(part) * shape.width
+    cut.middle = shape.middle
+    cut.moments = part * shape.moments
     cut.bend = part * shape.bend
     cut.least = shape.least
     cut.steepest = shape.steepest

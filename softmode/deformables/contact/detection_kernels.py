@@ -243,8 +243,8 @@ def march(
     """Return gap and normal of the half-space that stands for a shape along a way from ``x``, in the shape's frame.
 
     The way is marched by distances to the shape grown by ``thick``. To the body's inside (``back``), for a sample past
-    the middle of a thin plate or through it: where the way leaves the shape, else what is ``nearest`` to x. The way of a
-    fast sample: where it first meets the shape, or else passes nearest, with no ``onset`` of its contact.
+    the middle of a thin plate or through it: where the way leaves the shape, else what is ``nearest`` to x. The way of
+    a fast sample: where it first meets the shape, or else passes nearest, with no ``onset`` of its contact.
     """
     kind = shapes.kind[shape]
     scale = shapes.scale[shape]
