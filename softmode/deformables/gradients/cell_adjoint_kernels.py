@@ -232,8 +232,7 @@ def accumulate_cells(
         pressed = interpolate(basis.row, constraints.row[i, e], costate, i, instances.function_count[i])
         share_bar = wp.dot(pressed, constraints.force[i, e])
         share_bar += by_shape.bend * cut.bend
-        for k in range(3):
-            share_bar += wp.dot(by_shape.moments[k], cut.moments[k])
+        share_bar += wp.ddot(by_shape.moments, cut.moments)
         by_box, by_start, _by_share, _by_middle = wp.grad(part_loss)(
             box_beside(instances, basis, shapes, samples, i, row, shape), start, share_bar, middle_bar
         )
