@@ -21,7 +21,7 @@ from softmode.deformables.contact.cell_kernels import (
     touched_share,
     write_row,
 )
-from softmode.deformables.contact.face_kernels import face_on_cell, near_rim
+from softmode.deformables.contact.face_kernels import near_rim, part_under_face
 from softmode.deformables.contact.penalty_kernels import (
     BULK_FACTOR,
     HARDENING_DEPTH,
@@ -32,7 +32,16 @@ from softmode.deformables.contact.penalty_kernels import (
     shear_yield,
     stiffness_per_area,
 )
-from softmode.deformables.contact.ridge_kernels import NARROW, REACH, RIDGE, beside_edge, ridge_in_cell
+from softmode.deformables.contact.ridge_kernels import (
+    FAR,
+    RIDGE,
+    Box,
+    beside_edge,
+    inward_of,
+    reach_of,
+    ridge_at,
+    ridge_in_cell,
+)
 from softmode.deformables.contact.shape_query_kernels import (
     BOX,
     CAPSULE,
@@ -157,7 +166,7 @@ def bound_samples(
     samples.drift_lower[i] = drift_lower
     samples.drift_upper[i] = drift_upper
     side = wp.sqrt(instances.area[i] / float(instances.sample_count[i]))
-    grow = wp.vec3(wp.max(instances.margin[i], REACH * side) + instances.contact_radius[i])
+    grow = wp.vec3(wp.max(instances.margin[i], FAR * side) + instances.contact_radius[i])
     samples.lower[i] = lower - grow
     samples.upper[i] = upper + grow
 
@@ -301,7 +310,7 @@ def shape_frame(shapes: Shapes, shape: int):
 
 
 @wp.func
-def ridge_of(
+def box_beside(
     instances: Instances,
     basis: Basis,
     motion: Motion,
@@ -310,62 +319,64 @@ def ridge_of(
     i: int,
     row: int,
     shape: int,
-    gap: float,
     normal: wp.vec3d,
+    gap: wp.float64,
+    dent: float,
 ):
-    """Return length and depth of the edges of a box in a cell [m], and the normal of the cell into the body."""
+    """Return a box and the cell of a sample with a gap beside it, how its frame is turned, and whether an edge is near.
+
+    The normal is where it is nearest; ``dent`` as in ``reach_of`` [m].
+    """
     origin, rotation = shape_frame(shapes, shape)
-    x = wp.quat_rotate_inv(rotation, samples.position[i, row - instances.row_start[i]] - origin)
-    thick = shapes.margin[shape] + instances.contact_radius[i]
-    half = wp.vec3d(shapes.scale[shape] + wp.vec3(thick))
     side = instances.scale[i] * wp.sqrt(basis.row_area[row])
-    length = wp.float64(0.0)
-    depth = wp.float64(0.0)
-    inward = wp.vec3d()
-    if beside_edge(half, x, gap, side):
-        F = gradient_of(instances, basis, motion.q_start, i, row)
-        inward = -wp.normalize(wp.transpose(wp.inverse(F)) * wp.vec3d(basis.row_normal[row]))
-        length, depth = ridge_in_cell(
-            half, x, wp.quat_rotate_inv(rotation, inward), wp.float64(side), wp.dot(normal, inward)
-        )
-    return length, depth, inward
-
-
-@struct
-class BoxFace:
-    """Where the cell of a sample stands to a box."""
-
-    half: wp.vec3d  # extents [m]
-    rotation: wp.quatd
-    x: wp.vec3d  # the sample in its frame [m]
-    side: wp.float64  # of the cell [m]
-    normal: wp.vec3d  # of the cell at rest, outward
+    R = wp.transpose(wp.quat_to_matrix(rotation))
+    box = Box()
+    box.half = wp.vec3d(shapes.scale[shape] + wp.vec3(shapes.margin[shape] + instances.contact_radius[i]))
+    box.x = R * (samples.position[i, row - instances.row_start[i]] - origin)
+    box.normal = wp.vec3d(basis.row_normal[row])
+    box.front = R * normal
+    box.area = wp.float64(side * side)
+    box.reach = wp.float64(reach_of(side, dent))
+    box.dent = wp.float64(dent)
+    beside = beside_edge(box.half, box.x, gap, box.reach)
+    if beside:
+        box.F = R * gradient_of(instances, basis, motion.q_start, i, row)
+    return box, wp.transpose(R), beside
 
 
 @wp.func
-def box_beside(instances: Instances, basis: Basis, shapes: Shapes, samples: Samples, i: int, row: int, shape: int):
-    """Return where the cell of a sample stands to a box."""
-    origin, rotation = shape_frame(shapes, shape)
-    box = BoxFace()
-    box.half = wp.vec3d(shapes.scale[shape] + wp.vec3(shapes.margin[shape] + instances.contact_radius[i]))
-    box.rotation = rotation
-    box.x = wp.quat_rotate_inv(rotation, samples.position[i, row - instances.row_start[i]] - origin)
-    box.side = wp.float64(instances.scale[i] * wp.sqrt(basis.row_area[row]))
-    box.normal = wp.vec3d(basis.row_normal[row])
+def pressed_by(box: Box, instances: Instances, surface: Surface, i: int, row: int, k: wp.float64, give: wp.float64):
+    """Return a cell beside a box with what its edges press by; k is the stiffness of the penalty [N/m]."""
+    give_of_face = dent_compliance(instances, i, surface.relative_stiffness[row], surface.dent_length[row])
+    box.unit = RIDGE * box.dent / (wp.float64(give_of_face) * k)
+    box.give = give
     return box
 
 
 @wp.func
-def face_part(box: BoxFace, F: wp.mat33d):
-    """Return the axis of the face that a cell of gradient F lies on, its part under it, and its middle at rest [m].
+def face_part(
+    instances: Instances,
+    basis: Basis,
+    motion: Motion,
+    shapes: Shapes,
+    samples: Samples,
+    i: int,
+    row: int,
+    shape: int,
+):
+    """Return a box and the cell of a sample at its rim, how its frame is turned, and the face that the cell lies on.
 
-    As ``face_on_cell``; the middle is from the sample.
+    As ``part_under_face``.
     """
-    back = wp.inverse(F)
-    inward = -wp.quat_rotate_inv(box.rotation, wp.normalize(wp.transpose(back) * box.normal))
-    axis, part, local = face_on_cell(box.half, box.x, inward, box.side)
-    middle = back * wp.quat_rotate(box.rotation, local)
-    return axis, part, middle - wp.dot(middle, box.normal) * box.normal
+    none = wp.float64(0.0)
+    box, frame, _beside = box_beside(instances, basis, motion, shapes, samples, i, row, shape, wp.vec3d(), none, 0.0)
+    axis = int(-1)
+    part = wp.float64(1.0)
+    middle = wp.vec3d()
+    if near_rim(box):
+        box.F = wp.transpose(frame) * gradient_of(instances, basis, motion.q_start, i, row)
+        axis, part, middle = part_under_face(box)
+    return box, frame, axis, part, middle
 
 
 @wp.kernel(launch_bounds=(256, 2))
@@ -425,18 +436,16 @@ def find_contacts(
             query = query_heightfield(local, shapes.fields, shapes.fields.index[shape], far)
         query.distance -= thick
         part = float(1.0)
-        if kind == BOX and query.distance < wp.max(reach, REACH * side):
-            box = box_beside(instances, basis, shapes, samples, i, row, shape)
-            if near_rim(box.half, box.x, box.side):
-                axis, under, _middle = face_part(box, gradient_of(instances, basis, motion.q_start, i, row))
-                level = float(0.0)
-                if axis >= 0:
-                    level = float(wp.abs(box.x[axis]) - box.half[axis])
-                if axis >= 0 and level > -0.3 * OVERLAP * instances.size[i] and level < reach:
-                    part = float(under)
-                    query.distance = level
-                    query.normal = wp.vec3()
-                    query.normal[axis] = wp.where(box.x[axis] < wp.float64(0.0), -1.0, 1.0)
+        if kind == BOX and query.distance < wp.max(reach, FAR * side):
+            box, _frame, axis, under, _middle = face_part(instances, basis, motion, shapes, samples, i, row, shape)
+            level = float(1.0e30)
+            if axis >= 0:
+                level = float(wp.abs(box.x[axis]) - box.half[axis])
+            if level > -0.3 * OVERLAP * instances.size[i] and level < reach:
+                part = float(under)
+                query.distance = level
+                query.normal = wp.vec3()
+                query.normal[axis] = wp.where(box.x[axis] < wp.float64(0.0), -1.0, 1.0)
         # In general the half-space at the nearest point stands for the shape during the step, but
         along = wp.vec3()
         end = float(0.0)
@@ -460,13 +469,17 @@ def find_contacts(
             end = travel
         if end > 0.0:
             query = march(shapes, shape, local, query, along, end, back, thick, instances.smoothing[i], far)
-        if kind == BOX and query.distance >= reach and query.distance < REACH * side:
+        if kind == BOX and query.distance >= reach and query.distance < FAR * side:
             facing = wp.vec3d(wp.quat_rotate(turn, query.normal))
-            length, deep, _in = ridge_of(
-                instances, basis, motion, shapes, samples, i, row, shape, query.distance, facing
+            from_box = wp.float64(query.distance)
+            box, _frame, beside = box_beside(
+                instances, basis, motion, shapes, samples, i, row, shape, facing, from_box, 0.0
             )
-            if length > wp.float64(0.0) and deep > -wp.float64(reach):
-                reach = REACH * side
+            if beside:
+                inward = inward_of(box)
+                length, deep = ridge_in_cell(box.half, box.x, inward, box.area, box.reach, wp.dot(box.front, inward))
+                if length > wp.float64(0.0) and deep > -wp.float64(reach):
+                    reach = FAR * side
         gap = wp.float64(query.distance)
         if gap < wp.float64(reach) and gap < samples.gap[i, s, 1]:
             normal = wp.quat_rotate(turn, query.normal)
@@ -695,7 +708,7 @@ def gather_contacts(
             fade = fade_of(cell_shape, ahead, normal)
             touched = touched_share(surface, samples.shape, samples.gap, samples.part, cell_shape, fade, i, row, shape)
         if part < wp.float64(1.0):
-            _axis, _part, middle = face_part(box_beside(instances, basis, shapes, samples, i, row, shape), start)
+            _box, _frame, _axis, _part, middle = face_part(instances, basis, motion, shapes, samples, i, row, shape)
             gap += wp.dot(normal, start * middle)
             closing += wp.dot(normal, (ahead - start) * middle)
         cell_shape = part_of_cell(cell_shape, part)
@@ -721,20 +734,16 @@ def gather_contacts(
         cell.centre += middle
         ridge = wp.float64(0.0)
         ridge_lead = wp.float64(0.0)
-        if shapes.kind[shape] == BOX and part == wp.float64(1.0):
-            found = float(samples.gap[i, s, slot])
-            length, deep, inward = ridge_of(instances, basis, motion, shapes, samples, i, row, shape, found, normal)
-            face = cell.lead - gap
-            edge = wp.float64(0.5) * cell.onset + deep
-            if length > wp.float64(0.0) and dent > 0.0 and edge > face:
-                scale = wp.float64(instances.scale[i] * surface.dent_length[row])
-                narrow = wp.pow(wp.max(edge, wp.float64(0.0)) / scale, NARROW)
-                ridge = RIDGE * narrow * scale / wp.float64(dent) * length / stiffness
-                least = wp.min(wp.max(face, edge), wp.float64(0.0)) - cell_shape.least
-                push = wp.max(face - least, wp.float64(0.1) * cell_shape.least)  # of the face too where it is far
-                push /= wp.float64(1.0) + stiffness * compliance
-                normal = wp.normalize(push * normal + ridge * (edge - wp.max(face, least)) * inward)
-                ridge_lead = edge - face
+        if shapes.kind[shape] == BOX and dent > 0.0 and part == wp.float64(1.0):
+            found = samples.gap[i, s, slot]
+            long = instances.scale[i] * surface.dent_length[row]
+            box, frame, beside = box_beside(
+                instances, basis, motion, shapes, samples, i, row, shape, normal, found, long
+            )
+            if beside:
+                box = pressed_by(box, instances, surface, i, row, stiffness, stiffness * compliance)
+                ridge, ridge_lead, front = ridge_at(box, cell.lead - gap, cell.onset, cell_shape.least)
+                normal = wp.normalize(frame * front)
         constraints.ridge[i, e] = ridge
         constraints.ridge_lead[i, e] = ridge_lead  # always: nan from a step before would be felt, as 0 times it is nan
         # both bodies feel the force at one point, not the shape at its own surface: a pair of forces on two

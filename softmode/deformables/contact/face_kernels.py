@@ -11,6 +11,8 @@ Cells that lean against the face are left to its edges, see ``ridge_kernels``.
 
 import warp as wp
 
+from softmode.deformables.contact.ridge_kernels import Box, inward_of
+
 wp.set_module_options({"enable_backward": False})
 
 LEVEL, LEANING = wp.constant(wp.float64(0.15)), wp.constant(wp.float64(0.3))
@@ -20,27 +22,26 @@ LEAST = wp.constant(wp.float64(1.0e-2))
 
 
 @wp.func
-def near_rim(half: wp.vec3d, x: wp.vec3d, side: wp.float64):
-    """Return whether a sample at x is so near to two faces of a box that its cell may lie on a rim."""
+def near_rim(box: Box):
+    """Return whether a sample is so near to two faces of a box that its cell may lie on a rim."""
     near = int(0)
     for k in range(3):
-        if wp.abs(x[k]) > half[k] - side:
+        if wp.abs(box.x[k]) > box.half[k] - wp.sqrt(box.area):
             near += 1
     return near > 1
 
 
 @wp.func
-def face_on_cell(half: wp.vec3d, x: wp.vec3d, inward: wp.vec3d, side: wp.float64):
-    """Return the axis of the face of a box that a cell faces, its share under that, and where the middle of that is.
+def part_under_face(box: Box):
+    """Return the axis of the face of a box that a cell lies on, the part of the cell under it, and where that is.
 
-    The middle is from the sample [m]. The axis is -1 where the cell leans, lies within the face, or beside it.
-
-    Args:
-        half: Half extents of the box [m].
-        x: The sample in its frame [m].
-        inward: Normal of the cell there, into the body.
-        side: Of the cell [m].
+    Its middle, from the sample at rest [m]. The axis is -1 where the cell leans, is under the face as a whole or not at
+    all.
     """
+    half = box.half
+    x = box.x
+    side = wp.sqrt(box.area)
+    inward = inward_of(box)
     zero = wp.float64(0.0)
     one = wp.float64(1.0)
     reach = wp.float64(0.5) * side
@@ -72,4 +73,5 @@ def face_on_cell(half: wp.vec3d, x: wp.vec3d, inward: wp.vec3d, side: wp.float64
     total = share + (one - level) * under
     if not cut or level <= zero or total <= LEAST:
         return int(-1), one, wp.vec3d()
-    return axis, total, share / total * middle
+    rest = share / total * (wp.inverse(box.F) * middle)
+    return axis, total, rest - wp.dot(rest, box.normal) * box.normal

@@ -46,7 +46,7 @@ from softmode.errors import ConfigError, SolverDiverged
 Array = NDArray[np.float64]
 
 _CONSTRAINT = ("row", "partner_row", "shape", "normal", "offset", "stiffness", "dent_compliance", "dent_depth", "onset")
-_CONSTRAINT += ("ridge", "ridge_lead", "friction", "stick", "stick_deep")
+_CONSTRAINT += ("lead", "ridge", "ridge_lead", "friction", "stick", "stick_deep")
 """What a step's point constraints are made of, besides their count: members of the solver's ``PointConstraints``."""
 FLAT = 0.02
 """Turn of a normal [rad] over the size of a body up to which a shape counts as flat: what float32 leaves of a plane."""
@@ -203,7 +203,7 @@ class AdjointReduced:
         }
         of_constraints = (
             "constraint_slip constraint_normal constraint_gain constraint_hessian constraint memory memory_start "
-            "contact_bar normal_bar cell_gradient cell_place start_place start_gradient cell_spared cell_fade"
+            "contact_bar normal_bar cell_gradient cell_place cell_spared cell_fade edge_gradient edge_place"
         )
         axes = {"": "instance point", of_constraints: "instance constraint", "sample_place": "instance sample"}
         self._step = allocate(kernels.Linearised, axes, self._sizes, self.device)
