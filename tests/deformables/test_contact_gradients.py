@@ -64,7 +64,7 @@ class Landing:
                 body,
                 material=material,
                 position=(0.0, 0.0, height),
-                velocity=(0.3, 0.1, -1.0),
+                velocity=(0.3, 0.1, -1.0 if below is None else -0.6),
                 angular_velocity=(2.0, 1.0, 0.5),
                 contact_stiffness_per_area=stiffness,
             )
