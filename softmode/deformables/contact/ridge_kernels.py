@@ -21,7 +21,7 @@ wp.set_module_options({"enable_backward": False})
 
 REACH = wp.constant(0.85)
 """Distance to a box over the side of a cell up to which an edge may lie in the cell."""
-RIDGE, NARROW = wp.constant(wp.float64(0.372)), wp.constant(wp.float64(0.15))
+RIDGE, NARROW = wp.constant(wp.float64(0.388)), wp.constant(wp.float64(0.15))
 """Force per length of an edge of 90 degrees over E / (1 - nu^2) and depth, as deep as the dent under that pressure; the
 power of the depth with which it grows: 0.26 where it is 1 % of the edge of the default cube, 0.34 at 5 %."""
 
