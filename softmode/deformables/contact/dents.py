@@ -3,7 +3,7 @@
 n functions in a volume V resolve patches of the size h = (V / n)^(1/3). What a narrower patch would press in beyond
 their motion is, per pressure,
 
-    w = 0.34 h (1 - nu^2) / E (1 - c^2),
+    w = 0.35 h (1 - nu^2) / E (1 - c^2),
 
 a bed of springs (Winkler) of the scale that is missing, in series with the penalty of contact, less with the share c of
 the neighbourhood that touches: what presses on a whole face, the functions carry. It was fitted to pairs
@@ -32,7 +32,7 @@ from softmode.deformables.model.tables import allocate
 
 Array = NDArray[np.float64]
 
-DENT_FACTOR = 0.34
+DENT_FACTOR = 0.35
 """Dent over the size of what the functions resolve, under the pressure E / (1 - nu^2), where nothing around is touched.
 """
 WALL_SHARE = 0.6

@@ -29,7 +29,7 @@ FAR = wp.constant(1.5)
 steep as at a corner."""
 WETTED = wp.constant(wp.float64(0.125))
 """Least share of r of an edge that goes in steeply that is counted."""
-RIDGE, NARROW = wp.constant(wp.float64(0.372)), wp.constant(wp.float64(0.15))
+RIDGE, NARROW = wp.constant(wp.float64(0.413)), wp.constant(wp.float64(0.2))
 """Force per length of an edge of 90 degrees over E / (1 - nu^2) and depth, as deep as the dent under that pressure; the
 power of the depth with which it grows: 0.26 where it is 1 % of the edge of the default cube, 0.34 at 5 %."""
 
