@@ -203,7 +203,8 @@ class AdjointReduced:
         }
         of_constraints = (
             "constraint_slip constraint_normal constraint_gain constraint_hessian constraint memory memory_start "
-            "contact_bar normal_bar cell_gradient cell_place cell_spared cell_fade edge_gradient edge_place"
+            "contact_bar normal_bar cell_gradient cell_place cell_spared cell_fade edge_gradient edge_place "
+            "part_bar middle_bar"
         )
         axes = {"": "instance point", of_constraints: "instance constraint", "sample_place": "instance sample"}
         self._step = allocate(kernels.Linearised, axes, self._sizes, self.device)
@@ -481,6 +482,7 @@ class AdjointReduced:
         given = (*self._cells, t.constraints, t.arrays.q, costate, dt)
         t.launch(cell_kernels.accumulate_cells, constraints, *given, sums, self._step)
         touched = (t.instances, t.samples, t.surface, t.constraints, self._step)
+        t.launch(cell_kernels.accumulate_parts, constraints, *self._cells, t.constraints, sums, self._step)
         t.launch(cell_kernels.spread_over_neighbours, self.instances, *touched)
         found = (t.instances, t.basis, t.constraints, self._step, wp.float64(dt))
         t.launch(cell_kernels.propagate_cells, t.unknowns, *found, q_bar, qd_bar)

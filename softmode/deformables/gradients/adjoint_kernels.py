@@ -63,6 +63,8 @@ class Linearised:
     # and of what the dent along the surface is beside that across
     cell_gradient: wp.array2d[wp.mat33d]  # the loss by the gradient of a cell ahead, and
     cell_place: wp.array2d[wp.vec3d]  # by the sample's place ahead [1/m]
+    part_bar: wp.array2d[wp.float64]  # by ln of the part of the cell that is under a face, but for its neighbours, and
+    middle_bar: wp.array2d[wp.vec3d]  # by the middle of that, at rest [1/m]
     cell_spared: wp.array2d[wp.float64]  # by the share of the neighbourhood that does not touch
     edge_gradient: wp.array2d[wp.mat33d]  # the loss by the gradient of a cell at the start, and
     edge_place: wp.array2d[wp.vec3d]  # by the sample's place there, as edges feel them [1/m]

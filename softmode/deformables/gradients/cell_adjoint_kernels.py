@@ -23,6 +23,7 @@ from softmode.deformables.contact.cell_kernels import (
     part_of_cell,
     shape_of_cell,
     touched_share,
+    touching,
     write_row,
 )
 from softmode.deformables.contact.detection_kernels import (
@@ -189,6 +190,7 @@ def accumulate_cells(
     step.cell_spared[i, e] = wp.float64(0.0)
     step.edge_gradient[i, e] = wp.mat33d()
     step.edge_place[i, e] = wp.vec3d()
+    step.part_bar[i, e] = wp.float64(0.0)
     if e < instances.pin_count[i] or e >= constraints.count[i]:
         return
     zero = wp.float64(0.0)
@@ -279,11 +281,8 @@ def accumulate_cells(
         pressed = interpolate(basis.row, constraints.row[i, e], costate, i, instances.function_count[i])
         part_bar = wp.dot(pressed, constraints.force[i, e])
         part_bar += by_shape.bend * cut.bend + wp.ddot(by_shape.moments, cut.moments)
-        rim, turn, _axis, _part, _middle = face_part(instances, basis, motion, shapes, samples, i, row, shape)
-        by_rim, _by_part, _by_middle = wp.grad(part_loss)(rim, part_bar, middle_bar)
-        step.edge_gradient[i, e] = turn * by_rim.F
-        step.edge_place[i, e] = turn * by_rim.x
-        by_length += wp.float64(2.0) * by_rim.area * rim.area
+        step.part_bar[i, e] = part_bar
+        step.middle_bar[i, e] = middle_bar
     fade = fade_of(cell_shape, ahead, face)
     touched = zero
     spared = zero  # or one, far away: either does not change
@@ -329,6 +328,46 @@ def accumulate_cells(
     powers = stiffness_exponents(instances, i, BULK_FACTOR, firm, shape_area(shapes, shape), dt)
     powers = (by_log - by_unit) * (powers + dent_exponents(instances, i))
     sums.contact[i, e] = sums.contact[i, e] + powers + wp.vec4d(zero, by_shape.poissons_ratio, zero, by_scale)
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def accumulate_parts(
+    instances: Instances,
+    basis: Basis,
+    motion: Motion,
+    shapes: Shapes,
+    samples: Samples,
+    surface: Surface,
+    constraints: PointConstraints,
+    # In and out:
+    sums: Sums,
+    step: Linearised,
+):
+    """Pass the loss by the parts of cells under faces, which their neighbours count too, to what they follow."""
+    i, e = wp.tid()
+    if e < instances.pin_count[i] or e >= constraints.count[i]:
+        return
+    row = constraints.partner_row[i, e]
+    shape = constraints.shape[i, e]
+    s = row - instances.row_start[i]
+    slot = slot_of(samples, i, s, shape)
+    if samples.part[i, s, slot] == 1.0:
+        return
+    part_bar = step.part_bar[i, e]
+    for other in range(instances.pin_count[i], constraints.count[i]):
+        near = constraints.partner_row[i, other]
+        if constraints.shape[i, other] == shape and step.cell_spared[i, other] != wp.float64(0.0):
+            for m in range(surface.start[near], surface.start[near + 1]):
+                if surface.neighbour[m] == s:
+                    y = (step.cell_fade[i, other][0] - samples.gap[i, s, slot]) / step.cell_fade[i, other][1]
+                    counted = wp.float64(surface.weight[m] * samples.part[i, s, slot]) * touching(y)
+                    part_bar -= step.cell_spared[i, other] * counted
+    rim, turn, _axis, _part, _middle = face_part(instances, basis, motion, shapes, samples, i, row, shape)
+    by_rim, _by_part, _by_middle = wp.grad(part_loss)(rim, part_bar, step.middle_bar[i, e])
+    step.edge_gradient[i, e] = step.edge_gradient[i, e] + turn * by_rim.F
+    step.edge_place[i, e] = step.edge_place[i, e] + turn * by_rim.x
+    by_scale = wp.float64(2.0) * by_rim.area * rim.area
+    sums.contact[i, e] = sums.contact[i, e] + wp.vec4d(wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), by_scale)
 
 
 @wp.kernel
