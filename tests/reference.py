@@ -220,24 +220,28 @@ def normal_potential(
 
 
 def ridge_in_cell(
-    half: np.ndarray, x: np.ndarray, inward: np.ndarray, side: float, front: float
+    half: np.ndarray, x: np.ndarray, inward: np.ndarray, area: float, reach: float, front: float
 ) -> tuple[float, float]:
     """Return the length of the edges of a box in a cell and how deep they are on the mean [m].
 
-    Edge by edge: where the cell's plane through the sample is cut by the line of the edge's place, how far that is
-    beside the sample and beyond the edge's end.
+    Edge by edge: 0 to 1 of its length beside the sample by how far that is, and on it the part between both ends of the
+    cell that is there and deep, of 2,001 points; an eighth of half the cell at least.
     """
     facing, away = np.maximum(np.where(x < 0.0, -inward, inward), 0.0), np.abs(x) - half
     lengths, depths = [], []
     for k in range(3):
         slopes, gaps = np.delete(facing, k), np.delete(away, k)
-        reach = 0.85 * side / slopes.max() if slopes.max() > 0.0 else np.inf
         steep = np.clip((slopes.min() / max(slopes.max(), 1e-12) - 0.3) / 0.7, 0.0, None)
         if steep > 0.0:
+            far = reach / slopes.max()
             beside = abs(slopes[1] * gaps[0] - slopes[0] * gaps[1]) / np.linalg.norm(slopes)
-            hat, end = max(1.0 - beside / reach, 0.0), np.clip(0.5 - 0.5 * away[k] / reach, 0.0, 1.0)
-            lengths.append(np.linalg.norm(slopes) ** 3 * steep * hat * end * side**2 / reach)
-            depths.append(-slopes @ gaps - facing[k] * max(away[k], 0.0))
+            end = min(far, -away[k])
+            place = np.linspace(-far, end, 2001) if end > -far else np.full(1, -far)
+            deep = facing[k] * place - slopes @ gaps
+            first = -far if facing[k] == 0.0 else place[deep > 0.0].min() if (deep > 0.0).any() else end
+            wet = max(np.clip(end - first, far / 8.0, end + far), 0.0)
+            lengths.append(np.linalg.norm(slopes) ** 3 * steep * max(1.0 - beside / far, 0.0) * area * wet / far**2 / 2)
+            depths.append(deep[-1] - 0.5 * facing[k] * wet)
     total = sum(lengths)
     depth = float(np.dot(lengths, depths)) / total if total else 0.0
     return float(total * np.clip((front - 0.3) / 0.25, 0.0, 1.0)), depth

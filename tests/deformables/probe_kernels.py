@@ -128,15 +128,18 @@ def evaluate_ridges(
     half: wp.array[wp.vec3d],
     x: wp.array[wp.vec3d],
     inward: wp.array[wp.vec3d],
-    side: wp.array[wp.float64],
+    side: wp.array[float],
+    dent: wp.array[float],
     front: wp.array[wp.float64],
     # Out:
-    ridge_out: wp.array[wp.vec2d],
+    ridge_out: wp.array[wp.vec3d],
 ):
-    """Evaluate length and depth of the edges of a box in cells."""
+    """Evaluate length and depth of the edges of a box in cells, and the reach of these."""
     i = wp.tid()
-    length, depth = ridge_kernels.ridge_in_cell(half[i], x[i], inward[i], side[i], front[i])
-    ridge_out[i] = wp.vec2d(length, depth)
+    area = wp.float64(side[i] * side[i])
+    reach = wp.float64(ridge_kernels.reach_of(side[i], dent[i]))
+    length, depth = ridge_kernels.ridge_in_cell(half[i], x[i], inward[i], area, reach, front[i])
+    ridge_out[i] = wp.vec3d(length, depth, reach)
 
 
 @wp.kernel

@@ -6,6 +6,7 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
+from softmode.deformables.contact.ridge_kernels import RIDGE
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body
 from tests import reference
@@ -102,20 +103,39 @@ def test_along_a_path(kind: str) -> None:
     assert leaps.max() < (0.1 if kind == "corner" else 0.15)
 
 
-def test_ridges() -> None:
-    """Length and depth of edges in 200 cells are those of the twin, edge by edge: on all, and some have edges."""
+def cells(count: int, least: float, dent: float) -> tuple[list[np.ndarray], np.ndarray]:
+    """Return what cells beside edges are, sides from ``least`` to 10 mm and dents in m, and what is evaluated of it."""
     rng = np.random.default_rng(0)
-    half, side = rng.uniform(0.005, 0.03, (200, 3)), rng.uniform(0.003, 0.01, 200)
-    x = np.where(rng.random((200, 3)) < 0.5, -1.0, 1.0) * (half + rng.uniform(-1.0, 1.0, (200, 3)) * side[:, None])
-    inward, front = rng.normal(size=(200, 3)), rng.uniform(0.2, 1.0, 200)
+    half, side = rng.uniform(0.005, 0.03, (count, 3)), rng.uniform(least, 0.01, count).astype(np.float32)
+    x = np.where(rng.random((count, 3)) < 0.5, -1.0, 1.0) * (half + rng.uniform(-1, 1, (count, 3)) * side[:, None])
+    inward, front = rng.normal(size=(count, 3)), rng.uniform(0.2, 1.0, count)
     inward /= np.linalg.norm(inward, axis=1, keepdims=True)
     inputs = [wp.array(value, dtype=wp.vec3d, device="cpu") for value in (half, x, inward)]
-    inputs += [wp.array(value, dtype=wp.float64, device="cpu") for value in (side, front)]
-    out = wp.zeros(200, dtype=wp.vec2d, device="cpu")
-    wp.launch(evaluate_ridges, dim=200, inputs=inputs, outputs=[out], device="cpu")
-    expected = [reference.ridge_in_cell(*given) for given in zip(half, x, inward, side, front, strict=True)]
-    assert 20 < np.count_nonzero(out.numpy()[:, 0]) < 180
-    np.testing.assert_allclose(out.numpy(), expected, rtol=1.0e-6, atol=1.0e-9)  # reach is a float32
+    inputs += [wp.array(value, dtype=float, device="cpu") for value in (side, np.full(count, dent))]
+    out = wp.zeros(count, dtype=wp.vec3d, device="cpu")
+    front_of = wp.array(front, dtype=wp.float64, device="cpu")
+    wp.launch(evaluate_ridges, dim=count, inputs=[*inputs, front_of], outputs=[out], device="cpu")
+    return [half, x, inward, side.astype(float) ** 2, out.numpy()[:, 2], front], out.numpy()
+
+
+def test_ridges() -> None:
+    """Length and depth of edges in 200 cells are those of the twin, edge by edge: on all, and some have edges."""
+    given, found = cells(200, 0.003, 0.0)
+    expected = [reference.ridge_in_cell(*one) for one in zip(*given, strict=True)]
+    assert 20 < np.count_nonzero(found[:, 0]) < 180
+    np.testing.assert_allclose(found[:, 2], 0.85 * np.sqrt(given[3]), rtol=1.0e-6)
+    np.testing.assert_allclose(found[:, :2], expected, rtol=2.0e-3, atol=1.0e-5)  # of 2,001 points along an edge
+
+
+def test_an_edge_is_no_stiffer_than_a_face() -> None:
+    """However small the cells, RIDGE length v / area is less than 1 by what (depth / v)^0.2 grows to at 5 dents v.
+
+    A face is as stiff as 1 at least; cells of a millimetre of a cube of 10 cm would have 2.2.
+    """
+    dent = 0.00825
+    given, found = cells(4000, 1.0e-4, dent)
+    assert (float(RIDGE) * dent * found[:, 0] / given[3]).max() < 5.0**-0.2
+    assert (float(RIDGE) * dent * found[:, 0] / given[3] * found[:, 2] / (0.85 * np.sqrt(given[3]))).max() > 2.0
 
 
 def test_torsion() -> None:

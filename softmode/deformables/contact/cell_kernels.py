@@ -4,15 +4,17 @@ A sample stands for a cell of the surface, of the area A at rest. Its contact is
 that cell, which tilt and curvature spread evenly over a range e, the *onset* (see ``penalty_kernels``). With the normal
 n of what is touched, the rest normal N and F of the body a step's velocity ahead,
 
-    m = P_N F^T n                               slope of the gap over the cell
-    x = |m| L,  L = sqrt(3 A / pi)              range of a strip with the variance of a disc of area A
-    t = x / (1 + (x/a)^4) r^2/(7 + r^2)         range by tilt, none of a steep cell; r: compliance of the dent over that
-                                                of the penalty, a: ``steepest``
-    b = A (H + H_other) / (2 pi)                range by the mean curvatures of both: exact for a sphere
-    e = sqrt(e_0^2 + t^2 + b^2)                 e_0: ``contact_smoothing``
-    q = e/2 - gap - b/2 - l e_0 (e_0/e)^2       penetration, a step's velocity ahead
-    T = -min(L/2 - q L/(3 t), L t/(6 q)) m/|m|  centre of pressure from the sample, at rest, in the onset;
-                                                -L t/(12 (q - e/2)) m/|m| beyond
+    m = P_N F^T n                             slope of the gap over the cell
+    x = sqrt(m . M m)                         range of a strip with the variance of the cell, M twelve times its moments
+    u = 1 / (1 + (x/a)^8) r^4/(49 + r^4)      how far it turns, a steep cell not at all; r: compliance of the dent over
+                                              that of the penalty, a: ``steepest``
+    t = u x                                   range by tilt
+    b = A (H + H_other) / (2 pi)              range by the mean curvatures of both: exact for a sphere
+    e = sqrt(e_0^2 + t^2 + b^2)               e_0: ``contact_smoothing``
+    q = e/2 - b/2 - l e_0 (e_0/e)^2 - u m . d - gap    penetration, a step's velocity ahead, d the middle of the cell
+    T = u (d - (1/2 - q/(3 e)) u M m / e)     centre of pressure from the sample, at rest, in the onset;
+        u (d - 1/(12 q - 6 e) u M m)          beyond. Either is what the potential changes by as the cell tilts, over
+                                              its force: what rolls gets back on one side what it gave on the other
 
 The row of the contact is that of the sample plus T . grad: force and friction act at the centre of pressure. The dent
 of the sample is as much less as its neighbourhood touches the same thing: the functions carry what is wide.
@@ -35,13 +37,13 @@ FACING = wp.constant(wp.float64(0.2))
 """Cosine below which a cell belongs to a face around an edge, whose tilt says nothing of the gaps."""
 LATE = wp.constant(wp.float64(0.406))
 """How deep a level face lies in its onset when it is squeezed by 1 %, in e_0 at nu 0, see ``late_of``."""
-NEAR = wp.constant(wp.float64(0.5))
+NEAR = wp.constant(wp.float64(0.35))
 """Share of that bound, as a gap, beyond which a cell is level and nothing around it counts, as it cannot touch but by
 an impact: what flies past a shape must not feel that it might lean against it."""
-TURNING = wp.constant(wp.float64(7.0))
-"""Square of the dent, in penalties, with which a cell turns half of its way."""
+TURNING = wp.constant(wp.float64(49.0))
+"""Fourth power of the dent, in penalties, with which a cell turns half of its way."""
 LEVEL = wp.constant(wp.float64(1.0e-3))
-"""Range by tilt over e_0 below which a cell is level."""
+"""Share of its way below which a cell does not turn."""
 
 
 @struct
@@ -52,6 +54,8 @@ class Surface:
     dent_length: wp.array[float]  # dent at scale 1 under the pressure E / (1 - nu^2), see ``dents`` [m]
     slenderness: wp.array[float]  # size of the body over the smaller of it and three thicknesses
     curvature: wp.array[float]  # mean curvature of the asset at rest [1/m]
+    middle: wp.array[wp.vec3]  # of its cell, from the sample [m]
+    moments: wp.array[wp.mat33]  # twelve times the second moments of its cell about that [m^2]
     start: wp.array[int]  # (sample_total + 1,), where each sample's neighbourhood begins in
     neighbour: wp.array[int]  # samples, counted within their body, and
     weight: wp.array[float]  # their weights, of sum ``CARRIED``
@@ -73,7 +77,8 @@ class CellShape:
     """What a cell is, whatever its body does."""
 
     normal: wp.vec3d  # at rest, outward
-    width: wp.float64  # L [m]
+    middle: wp.vec3d  # d [m]
+    moments: wp.mat33d  # M [m^2]
     bend: wp.float64  # b [m]
     least: wp.float64  # e_0 [m]
     steepest: wp.float64  # range by tilt beyond which a cell counts as level again: most of the margin [m]
@@ -101,33 +106,37 @@ def shape_of_cell(surface: Surface, instances: Instances, basis: Basis, i: int, 
     s = instances.scale[i]
     area = wp.float64(basis.row_area[row])
     shape.normal = wp.vec3d(basis.row_normal[row])
-    shape.width = wp.sqrt(wp.float64(3.0) / PI * area)
+    shape.middle = wp.vec3d(surface.middle[row])
+    shape.moments = wp.mat33d(surface.moments[row])
     bend = wp.float64(s * s) * area * wp.float64(surface.curvature[row] / s + other) / (wp.float64(2.0) * PI)
     shape.bend = wp.max(bend, wp.float64(0.0))
     shape.least = wp.float64(instances.smoothing[i] / surface.slenderness[row])
-    shape.steepest = wp.float64(0.7 * instances.margin[i] / surface.slenderness[row])
+    shape.steepest = wp.float64(instances.margin[i] / surface.slenderness[row])
     shape.fade = wp.float64(FADE * instances.size[i])
     shape.poissons_ratio = wp.float64(instances.poissons_ratio[i])
     return shape
 
 
 @wp.func
-def lean_of(shape: CellShape, F: wp.mat33d, n: wp.vec3d):
-    """Return t m / |m| of a cell [m] whose body has the gradient F; n is the normal of what it touches."""
+def slope_of(shape: CellShape, F: wp.mat33d, n: wp.vec3d):
+    """Return m of a cell whose body has the gradient F, n the normal of what it touches, and how little it is steep."""
     one = wp.float64(1.0)
     pull = wp.transpose(F) * n
     facing = -wp.dot(pull, shape.normal)
+    slope = pull + facing * shape.normal
+    share = wp.dot(slope, shape.moments * slope) / (shape.steepest * shape.steepest)
+    share *= share
+    steady = one / (one + share * share)
     if facing <= FACING * wp.length(pull):
-        return wp.vec3d()
-    lean = shape.width * (pull + facing * shape.normal)
-    share = wp.length_sq(lean) / (shape.steepest * shape.steepest)
-    return lean / (one + share * share)
+        steady = wp.float64(0.0)
+    return slope, steady
 
 
 @wp.func
 def fade_of(shape: CellShape, F: wp.mat33d, n: wp.vec3d):
     """Return the range of the gap over which a neighbour counts as touching less and less [m]."""
-    ranges = wp.length_sq(lean_of(shape, F, n)) + shape.bend * shape.bend
+    slope, steady = slope_of(shape, F, n)
+    ranges = steady * steady * wp.dot(slope, shape.moments * slope) + shape.bend * shape.bend
     return shape.fade + wp.sqrt(ranges + wp.float64(1.0e-24))  # which has a derivative at zero
 
 
@@ -140,26 +149,40 @@ def cell_at(shape: CellShape, F: wp.mat33d, n: wp.vec3d, gap: wp.float64, closin
     what it would lean against.
     """
     half = wp.float64(0.5)
-    zero = wp.float64(0.0)
-    lean = ratio * ratio / (TURNING + ratio * ratio) * lean_of(shape, F, n)
+    slope, turn = slope_of(shape, F, n)
+    dent = ratio * ratio * ratio * ratio
+    turn *= dent / (TURNING + dent)
     if gap > NEAR * shape.steepest:
-        lean = wp.vec3d()
-    tilt = wp.length(lean)
+        turn = wp.float64(0.0)
+    slope = turn * slope
+    lean = shape.moments * slope
     cell = Cell()
-    cell.onset = wp.sqrt(shape.least * shape.least + shape.bend * shape.bend + tilt * tilt)
+    cell.onset = wp.sqrt(shape.least * shape.least + shape.bend * shape.bend + wp.dot(slope, lean))
     level = shape.least / cell.onset
     cell.lead = half * (cell.onset - shape.bend) - late_of(shape.poissons_ratio) * level * level * shape.least
-    if tilt > LEVEL * shape.least:
-        q = cell.lead - gap - closing
-        at = half * shape.width
+    cell.lead -= wp.dot(slope, shape.middle)
+    if turn > LEVEL:
+        q = wp.max(cell.lead - gap - closing, wp.float64(0.0))
+        arm = half / cell.onset - q / (wp.float64(3.0) * cell.onset * cell.onset)
         if q > cell.onset:
-            at = shape.width * tilt / (wp.float64(12.0) * q - wp.float64(6.0) * cell.onset)
-        elif q > zero:
-            if q < tilt:
-                at -= q * shape.width / (wp.float64(3.0) * tilt)
-            at = wp.min(at, shape.width * tilt / (wp.float64(6.0) * q))
-        cell.centre = -at / tilt * lean
+            arm = wp.float64(1.0) / (wp.float64(12.0) * q - wp.float64(6.0) * cell.onset)
+        cell.centre = turn * (shape.middle - arm * lean)
     return cell
+
+
+@wp.func
+def part_of_cell(shape: CellShape, part: wp.float64):
+    """Return a cell of which a part is under a face."""
+    cut = CellShape()
+    cut.normal = shape.normal
+    cut.middle = shape.middle
+    cut.moments = part * shape.moments
+    cut.bend = part * shape.bend
+    cut.least = shape.least
+    cut.steepest = shape.steepest
+    cut.fade = shape.fade
+    cut.poissons_ratio = shape.poissons_ratio
+    return cut
 
 
 @wp.func
@@ -188,6 +211,7 @@ def touched_share(
     surface: Surface,
     found: wp.array3d[int],  # (instance_count, sample_max, SLOTS), what is touched
     gap: wp.array3d[wp.float64],  # likewise [m]
+    part: wp.array3d[float],  # likewise, of the cell what lies under it; of one entry: all
     shape: CellShape,
     fade: wp.float64,
     i: int,
@@ -200,7 +224,10 @@ def touched_share(
         t = surface.neighbour[k]
         for slot in range(SLOTS):
             if found[i, t, slot] == other:
-                carried += wp.float64(surface.weight[k]) * touching(neighbour_at(shape, fade, gap[i, t, slot]))
+                weight = wp.float64(surface.weight[k])
+                if part.shape[1] > 1:
+                    weight *= wp.float64(part[i, t, slot])
+                carried += weight * touching(neighbour_at(shape, fade, gap[i, t, slot]))
     return carried
 
 

@@ -16,10 +16,12 @@ from softmode.deformables.contact.cell_kernels import (
     cell_at,
     fade_of,
     gradient_of,
+    part_of_cell,
     shape_of_cell,
     touched_share,
     write_row,
 )
+from softmode.deformables.contact.face_kernels import near_rim, part_under_face
 from softmode.deformables.contact.penalty_kernels import (
     BULK_FACTOR,
     HARDENING_DEPTH,
@@ -30,7 +32,16 @@ from softmode.deformables.contact.penalty_kernels import (
     shear_yield,
     stiffness_per_area,
 )
-from softmode.deformables.contact.ridge_kernels import NARROW, REACH, RIDGE, beside_edge, ridge_in_cell
+from softmode.deformables.contact.ridge_kernels import (
+    FAR,
+    RIDGE,
+    Box,
+    beside_edge,
+    inward_of,
+    reach_of,
+    ridge_at,
+    ridge_in_cell,
+)
 from softmode.deformables.contact.shape_query_kernels import (
     BOX,
     CAPSULE,
@@ -155,7 +166,7 @@ def bound_samples(
     samples.drift_lower[i] = drift_lower
     samples.drift_upper[i] = drift_upper
     side = wp.sqrt(instances.area[i] / float(instances.sample_count[i]))
-    grow = wp.vec3(wp.max(instances.margin[i], REACH * side) + instances.contact_radius[i])
+    grow = wp.vec3(wp.max(instances.margin[i], FAR * side) + instances.contact_radius[i])
     samples.lower[i] = lower - grow
     samples.upper[i] = upper + grow
 
@@ -241,9 +252,8 @@ def march(
     """Return gap and normal of the half-space that stands for a shape along a way from ``x``, in the shape's frame.
 
     The way is marched by distances to the shape grown by ``thick``. To the body's inside (``back``), for a sample past
-    the middle of a thin plate, through it, or beside the flank of a box: where the way leaves the shape, else what is
-    ``nearest`` to x. The way of a fast sample: where it first meets the shape, or else passes nearest, with no
-    ``onset`` of its contact.
+    the middle of a thin plate or through it: where the way leaves the shape, else what is ``nearest`` to x. The way of
+    a fast sample: where it first meets the shape, or else passes nearest, with no ``onset`` of its contact.
     """
     kind = shapes.kind[shape]
     scale = shapes.scale[shape]
@@ -300,7 +310,7 @@ def shape_frame(shapes: Shapes, shape: int):
 
 
 @wp.func
-def ridge_of(
+def box_beside(
     instances: Instances,
     basis: Basis,
     motion: Motion,
@@ -309,25 +319,64 @@ def ridge_of(
     i: int,
     row: int,
     shape: int,
-    gap: float,
     normal: wp.vec3d,
+    gap: wp.float64,
+    dent: float,
 ):
-    """Return length and depth of the edges of a box in a cell [m], and the normal of the cell into the body."""
+    """Return a box and the cell of a sample with a gap beside it, how its frame is turned, and whether an edge is near.
+
+    The normal is where it is nearest; ``dent`` as in ``reach_of`` [m].
+    """
     origin, rotation = shape_frame(shapes, shape)
-    x = wp.quat_rotate_inv(rotation, samples.position[i, row - instances.row_start[i]] - origin)
-    thick = shapes.margin[shape] + instances.contact_radius[i]
-    half = wp.vec3d(shapes.scale[shape] + wp.vec3(thick))
     side = instances.scale[i] * wp.sqrt(basis.row_area[row])
-    length = wp.float64(0.0)
-    depth = wp.float64(0.0)
-    inward = wp.vec3d()
-    if beside_edge(half, x, gap, side):
-        F = gradient_of(instances, basis, motion.q_start, i, row)
-        inward = -wp.normalize(wp.transpose(wp.inverse(F)) * wp.vec3d(basis.row_normal[row]))
-        length, depth = ridge_in_cell(
-            half, x, wp.quat_rotate_inv(rotation, inward), wp.float64(side), wp.dot(normal, inward)
-        )
-    return length, depth, inward
+    R = wp.transpose(wp.quat_to_matrix(rotation))
+    box = Box()
+    box.half = wp.vec3d(shapes.scale[shape] + wp.vec3(shapes.margin[shape] + instances.contact_radius[i]))
+    box.x = R * (samples.position[i, row - instances.row_start[i]] - origin)
+    box.normal = wp.vec3d(basis.row_normal[row])
+    box.front = R * normal
+    box.area = wp.float64(side * side)
+    box.reach = wp.float64(reach_of(side, dent))
+    box.dent = wp.float64(dent)
+    beside = beside_edge(box.half, box.x, gap, box.reach)
+    if beside:
+        box.F = R * gradient_of(instances, basis, motion.q_start, i, row)
+    return box, wp.transpose(R), beside
+
+
+@wp.func
+def pressed_by(box: Box, instances: Instances, surface: Surface, i: int, row: int, k: wp.float64, give: wp.float64):
+    """Return a cell beside a box with what its edges press by; k is the stiffness of the penalty [N/m]."""
+    give_of_face = dent_compliance(instances, i, surface.relative_stiffness[row], surface.dent_length[row])
+    box.unit = RIDGE * box.dent / (wp.float64(give_of_face) * k)
+    box.give = give
+    return box
+
+
+@wp.func
+def face_part(
+    instances: Instances,
+    basis: Basis,
+    motion: Motion,
+    shapes: Shapes,
+    samples: Samples,
+    i: int,
+    row: int,
+    shape: int,
+):
+    """Return a box and the cell of a sample at its rim, how its frame is turned, and the face that the cell lies on.
+
+    As ``part_under_face``.
+    """
+    none = wp.float64(0.0)
+    box, frame, _beside = box_beside(instances, basis, motion, shapes, samples, i, row, shape, wp.vec3d(), none, 0.0)
+    axis = int(-1)
+    part = wp.float64(1.0)
+    middle = wp.vec3d()
+    if near_rim(box):
+        box.F = wp.transpose(frame) * gradient_of(instances, basis, motion.q_start, i, row)
+        axis, part, middle = part_under_face(box)
+    return box, frame, axis, part, middle
 
 
 @wp.kernel(launch_bounds=(256, 2))
@@ -386,6 +435,19 @@ def find_contacts(
         if kind == HEIGHTFIELD:
             query = query_heightfield(local, shapes.fields, shapes.fields.index[shape], far)
         query.distance -= thick
+        part = float(1.0)
+        if kind == BOX and query.distance < wp.max(reach, FAR * side):
+            box, _frame, axis, under, _middle = face_part(instances, basis, motion, shapes, samples, i, row, shape)
+            level = float(1.0e30)
+            if axis >= 0:
+                level = float(wp.abs(box.x[axis]) - box.half[axis])
+            # beside a flank no deeper than a step may start
+            nearest = wp.abs(query.distance - level) < 1.0e-6
+            if level < reach and (nearest or level > -OVERLAP * instances.size[i]):
+                part = float(under)
+                query.distance = level
+                query.normal = wp.vec3()
+                query.normal[axis] = wp.where(box.x[axis] < wp.float64(0.0), -1.0, 1.0)
         # In general the half-space at the nearest point stands for the shape during the step, but
         along = wp.vec3()
         end = float(0.0)
@@ -393,7 +455,7 @@ def find_contacts(
         depth = instances.scale[i] * float(wp.length(basis.inner_point[row]))
         travel = wp.length(drift)
         touched = stuck[0] == shape or stuck[1] == shape or dt_before[i] == wp.float64(0.0)
-        if query.distance <= 0.0 or (touched and query.distance < 2.0 * depth):
+        if part == 1.0 and (query.distance <= 0.0 or (touched and query.distance < 2.0 * depth)):
             bent = interpolate(basis.inner_row, row, motion.q_start, i, instances.function_count[i])
             inner = wp.quat_rotate_inv(turn, wp.vec3(basis.inner_point[row] + bent))
             depth = wp.length(inner)
@@ -403,24 +465,23 @@ def find_contacts(
                 along = inner / depth
                 end = 2.0 * depth
                 back = 1
-            elif kind == BOX and query.distance <= 0.0 and wp.dot(query.normal, inner) < OPPOSED * depth:
-                # beside a flank, under the rim of a finger: not aside, from as deep as contact with edges dents
-                along = inner / depth
-                end = 0.3 * OVERLAP * instances.size[i]
-                back = 1
         if end == 0.0 and query.distance > 0.0 and travel > instances.margin[i] and travel > query.distance:
             # a half-space at the start would also stop fast samples that fly past a small shape
             along = wp.quat_rotate_inv(turn, drift) / travel
             end = travel
         if end > 0.0:
             query = march(shapes, shape, local, query, along, end, back, thick, instances.smoothing[i], far)
-        if kind == BOX and query.distance >= reach and query.distance < REACH * side:
+        if kind == BOX and query.distance >= reach and query.distance < FAR * side:
             facing = wp.vec3d(wp.quat_rotate(turn, query.normal))
-            length, deep, _in = ridge_of(
-                instances, basis, motion, shapes, samples, i, row, shape, query.distance, facing
+            from_box = wp.float64(query.distance)
+            box, _frame, beside = box_beside(
+                instances, basis, motion, shapes, samples, i, row, shape, facing, from_box, 0.0
             )
-            if length > wp.float64(0.0) and deep > -wp.float64(reach):
-                reach = REACH * side
+            if beside:
+                inward = inward_of(box)
+                length, deep = ridge_in_cell(box.half, box.x, inward, box.area, box.reach, wp.dot(box.front, inward))
+                if length > wp.float64(0.0) and deep > -wp.float64(reach):
+                    reach = FAR * side
         gap = wp.float64(query.distance)
         if gap < wp.float64(reach) and gap < samples.gap[i, s, 1]:
             normal = wp.quat_rotate(turn, query.normal)
@@ -429,10 +490,12 @@ def find_contacts(
                 samples.shape[i, s, 1] = samples.shape[i, s, 0]
                 samples.gap[i, s, 1] = samples.gap[i, s, 0]
                 samples.normal[i, s, 1] = samples.normal[i, s, 0]
+                samples.part[i, s, 1] = samples.part[i, s, 0]
                 slot = 0
             samples.shape[i, s, slot] = shape
             samples.gap[i, s, slot] = gap
             samples.normal[i, s, slot] = normal
+            samples.part[i, s, slot] = part
 
 
 @wp.func
@@ -634,16 +697,25 @@ def gather_contacts(
         # of unit length in float64: what is left of the gap in the slip must not count against the stick range
         normal = wp.normalize(wp.vec3d(samples.normal[i, s, slot]))
         cell_shape = shape_of_cell(surface, instances, basis, i, row, curvature_of(shapes, shape, normal))
+        part = wp.float64(samples.part[i, s, slot])
         start = wp.mat33d()
         ahead = wp.mat33d()
         closing = wp.float64(0.0)
         touched = wp.float64(0.0)
-        if gap <= NEAR * cell_shape.steepest:
+        middle = wp.vec3d()
+        beside = gap <= NEAR * cell_shape.steepest
+        if beside or part < wp.float64(1.0):
             start, ahead, closing = motion_of_cell(instances, basis, motion, shapes, samples, i, row, shape, normal, dt)
+        if beside:
             fade = fade_of(cell_shape, ahead, normal)
-            touched = touched_share(surface, samples.shape, samples.gap, cell_shape, fade, i, row, shape)
+            touched = touched_share(surface, samples.shape, samples.gap, samples.part, cell_shape, fade, i, row, shape)
+        if part < wp.float64(1.0):
+            _box, _frame, _axis, _part, middle = face_part(instances, basis, motion, shapes, samples, i, row, shape)
+            gap += wp.dot(normal, start * middle)
+            closing += wp.dot(normal, (ahead - start) * middle)
+        cell_shape = part_of_cell(cell_shape, part)
         spared = float(wp.float64(1.0) - touched * touched)
-        area = wp.max(sample_area(instances.scale[i], basis.row_area[row]), 1.0e-30)
+        area = wp.max(float(part) * sample_area(instances.scale[i], basis.row_area[row]), 1.0e-30)
         relative = surface.relative_stiffness[row]
         partner_mass = float(0.0)
         if shapes.body[shape] >= 0 and prescribed == 0:
@@ -661,22 +733,19 @@ def gather_contacts(
         ratio = stiffness * compliance * wp.float64(share * share)
         cell = cell_at(cell_shape, ahead, normal, gap, closing, ratio)
         turned = wp.dot(normal, (ahead - start) * cell.centre)
+        cell.centre += middle
         ridge = wp.float64(0.0)
         ridge_lead = wp.float64(0.0)
-        if shapes.kind[shape] == BOX:
-            found = float(samples.gap[i, s, slot])
-            length, deep, inward = ridge_of(instances, basis, motion, shapes, samples, i, row, shape, found, normal)
-            face = cell.lead - gap
-            edge = wp.float64(0.5) * cell.onset + deep
-            if length > wp.float64(0.0) and dent > 0.0 and edge > face:
-                scale = wp.float64(instances.scale[i] * surface.dent_length[row])
-                narrow = wp.pow(wp.max(edge, wp.float64(0.0)) / scale, NARROW)
-                ridge = RIDGE * narrow * scale / wp.float64(dent) * length / stiffness
-                least = wp.min(wp.max(face, edge), wp.float64(0.0)) - cell_shape.least
-                push = wp.max(face - least, wp.float64(0.1) * cell_shape.least)  # of the face too where it is far
-                push /= wp.float64(1.0) + stiffness * compliance
-                normal = wp.normalize(push * normal + ridge * (edge - wp.max(face, least)) * inward)
-                ridge_lead = edge - face
+        if shapes.kind[shape] == BOX and dent > 0.0 and part == wp.float64(1.0):
+            found = samples.gap[i, s, slot]
+            long = instances.scale[i] * surface.dent_length[row]
+            box, frame, beside = box_beside(
+                instances, basis, motion, shapes, samples, i, row, shape, normal, found, long
+            )
+            if beside:
+                box = pressed_by(box, instances, surface, i, row, stiffness, stiffness * compliance)
+                ridge, ridge_lead, front = ridge_at(box, cell.lead - gap, cell.onset, cell_shape.least)
+                normal = wp.normalize(frame * front)
         constraints.ridge[i, e] = ridge
         constraints.ridge_lead[i, e] = ridge_lead  # always: nan from a step before would be felt, as 0 times it is nan
         # both bodies feel the force at one point, not the shape at its own surface: a pair of forces on two

@@ -50,7 +50,7 @@ ALONG = wp.constant(wp.float64(0.15))
 """Largest dent along the surface over that across it. What rolls needs 0.05 mm of it, what turns under a finger 0.3 mm.
 Without a bound a soft body that fingers pinch at few samples gets out from between them: contact there hardens across,
 and must along."""
-LEAST_ALONG, GROWTH = wp.constant(wp.float64(0.5)), wp.constant(wp.float64(3.0))
+LEAST_ALONG, GROWTH = wp.constant(wp.float64(0.46)), wp.constant(wp.float64(2.7))
 """Dent along the surface over Mindlin's where nothing around is touched, and how much more per share c."""
 HARDENING_RANGE = wp.constant(wp.float64(2.0))
 """Range of the onset of what it gains, in ranges of the contact's onset."""

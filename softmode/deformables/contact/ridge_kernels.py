@@ -17,11 +17,19 @@ say of corners.
 
 import warp as wp
 
+from softmode.deformables.contact.cell_kernels import touching
+from softmode.deformables.model.declare import struct
+
 wp.set_module_options({"enable_backward": False})
 
 REACH = wp.constant(0.85)
-"""Distance to a box over the side of a cell up to which an edge may lie in the cell."""
-RIDGE, NARROW = wp.constant(wp.float64(0.365)), wp.constant(wp.float64(0.15))
+"""Reach r of a level cell over its side."""
+FAR = wp.constant(1.5)
+"""Distance to a box over the side of a cell up to which an edge may lie in the cell: beside the sample, and as
+steep as at a corner."""
+WETTED = wp.constant(wp.float64(0.125))
+"""Least share of r of an edge that goes in steeply that is counted."""
+RIDGE, NARROW = wp.constant(wp.float64(0.413)), wp.constant(wp.float64(0.2))
 """Force per length of an edge of 90 degrees over E / (1 - nu^2) and depth, as deep as the dent under that pressure; the
 power of the depth with which it grows: 0.26 where it is 1 % of the edge of the default cube, 0.34 at 5 %."""
 
@@ -33,8 +41,33 @@ FLANK, FRONT = wp.constant(wp.float64(0.3)), wp.constant(wp.float64(0.55))
 edge counts nothing, since the plane of the cell goes on where the cell ends; from the second on it counts."""
 
 
+@struct
+class Box:
+    """A box and the cell of a sample that touches it; vectors in the frame of the box."""
+
+    half: wp.vec3d  # extents [m]
+    x: wp.vec3d  # the sample
+    F: wp.mat33d  # its deformation gradient
+    normal: wp.vec3d  # outward normal of the cell at rest, which F turns and the frame does not
+    front: wp.vec3d  # normal of what is nearest
+    area: wp.float64  # of the cell [m^2]
+    reach: wp.float64  # its r [m]
+    dent: wp.float64  # dent under the pressure E / (1 - nu^2) [m]
+    unit: wp.float64  # force per length of an edge as deep, over depth and the stiffness of the penalty [1/m]
+    give: wp.float64  # dent besides the penalty, over what that gives
+
+
 @wp.func
-def beside_edge(half: wp.vec3d, x: wp.vec3d, gap: float, side: float):
+def reach_of(side: float, dent: float):
+    """Return the reach r of a level cell of a side [m]: not so little that an edge is stiffer than a face.
+
+    A face gives by ``dent`` [m] under the pressure E / (1 - nu^2) at the most.
+    """
+    return wp.max(REACH * side, float(RIDGE) * dent)
+
+
+@wp.func
+def beside_edge(half: wp.vec3d, x: wp.vec3d, gap: wp.float64, reach: wp.float64):
     """Return whether a sample with a gap [m] has an edge of a box near it.
 
     Not beyond a corner, where no cell reaches an edge, nor if the gap is of a way through the box: the contact then has
@@ -46,26 +79,29 @@ def beside_edge(half: wp.vec3d, x: wp.vec3d, gap: float, side: float):
     out = wp.vec3d()
     for k in range(3):
         away = wp.abs(x[k]) - half[k]
-        if away > wp.float64(-2.0 * REACH * side):
+        if away > wp.float64(-2.0) * reach:
             near += 1
         if away > wp.float64(0.0):
             outside += 1
             out[k] = away
         deepest = wp.max(deepest, away)
-    distance = float(wp.where(outside > 0, wp.length(out), deepest))
-    rounding = 2.0e-6 * wp.max(1.0, float(wp.max(half)))  # of distances in float32
+    distance = wp.where(outside > 0, wp.length(out), deepest)
+    rounding = wp.float64(2.0e-6) * wp.max(wp.float64(1.0), wp.max(half))  # of distances in float32
     return near > 1 and outside < 3 and wp.abs(distance - gap) < rounding
 
 
 @wp.func
-def ridge_in_cell(half: wp.vec3d, x: wp.vec3d, inward: wp.vec3d, side: wp.float64, front: wp.float64):
+def ridge_in_cell(
+    half: wp.vec3d, x: wp.vec3d, inward: wp.vec3d, area: wp.float64, reach: wp.float64, front: wp.float64
+):
     """Return the length of edges in a cell [m], as if they were steep on both sides, and how deep they are in [m].
 
     Args:
         half: Half extents of the box [m].
         x: The sample in its frame [m].
         inward: Normal of the cell there, into the body.
-        side: Of the cell [m].
+        area: Of the cell [m^2].
+        reach: Its r [m].
         front: Cosine between the normals of the contact and of the cell.
     """
     zero = wp.float64(0.0)
@@ -85,13 +121,45 @@ def ridge_in_cell(half: wp.vec3d, x: wp.vec3d, inward: wp.vec3d, side: wp.float6
         sharp = wp.min(facing[i], facing[j]) / wp.max(most, wp.float64(1.0e-12))
         if sharp > STEEP:
             both = facing[i] * facing[i] + facing[j] * facing[j]
-            reach = wp.float64(REACH) * side / most
+            far = reach / most
             beside = wp.abs(facing[j] * away[i] - facing[i] * away[j]) / wp.sqrt(both)
-            near = wp.max(one - beside / reach, zero)
-            end = wp.clamp(one / two - away[k] / (two * reach), zero, one)
-            part = wp.sqrt(both) * both * (sharp - STEEP) / (one - STEEP) * near * end * side * side / reach
+            near = wp.max(one - beside / far, zero)
+            end = wp.min(far, -away[k])  # of the edge in the cell, from the place beside the sample on
+            deep = facing[k] * end - facing[i] * away[i] - facing[j] * away[j]
+            wet = wp.max(far + end, zero)
+            if facing[k] * wet > wp.max(deep, zero):
+                wet = wp.min(wp.max(deep / facing[k], WETTED * far), wet)
+            part = wp.sqrt(both) * both * (sharp - STEEP) / (one - STEEP) * near * area * wet / (two * far * far)
             length += part
-            over = facing[k] * wp.max(away[k], zero)
-            moment -= part * (facing[i] * away[i] + facing[j] * away[j] + over)
+            moment += part * (deep - facing[k] * wet / two)
     depth = moment / wp.max(length, wp.float64(1.0e-30))
     return length * wp.clamp((front - FLANK) / (FRONT - FLANK), zero, one), depth
+
+
+@wp.func
+def inward_of(box: Box):
+    """Return the normal of the cell into the body."""
+    return -wp.normalize(wp.transpose(wp.inverse(box.F)) * box.normal)
+
+
+@wp.func
+def ridge_at(box: Box, face: wp.float64, onset: wp.float64, least: wp.float64):
+    """Return stiffness of the edges in a cell over that of its penalty, how much deeper they are in, and the normal.
+
+    Args:
+        box: The box and the cell.
+        face: How deep the face is in [m].
+        onset: Range of the onset [m].
+        least: That of a level cell [m].
+    """
+    zero = wp.float64(0.0)
+    inward = inward_of(box)
+    length, depth = ridge_in_cell(box.half, box.x, inward, box.area, box.reach, wp.dot(box.front, inward))
+    edge = wp.float64(0.5) * onset + depth
+    ridge = zero
+    normal = box.front
+    if length > zero and edge > wp.max(face, zero):
+        ridge = box.unit * wp.pow(wp.max(edge, least) / box.dent, NARROW) * touching(edge / least) * length
+        push = wp.max(face + least, wp.float64(0.1) * least) / (wp.float64(1.0) + box.give)  # where it is far, too
+        normal = wp.normalize(push * box.front + ridge * (edge - wp.max(face, -least)) * inward)
+    return ridge, edge - face, normal

@@ -3,7 +3,7 @@
 import warp as wp
 
 from softmode.deformables.contact.detection_kernels import CULLED, Shapes
-from softmode.deformables.contact.ridge_kernels import REACH
+from softmode.deformables.contact.ridge_kernels import FAR
 from softmode.deformables.contact.shape_query_kernels import BOX, HEIGHTFIELD, PLANE
 from softmode.deformables.model.interpolation_cpu_kernels import interpolate_rows
 from softmode.deformables.model.lane_kernels import LANES
@@ -14,7 +14,7 @@ wp.set_module_options({"enable_backward": False})
 SLACK = 1.0e-5
 """Rounding of distances in float32, over the larger of 1 m and the coordinates of a shape."""
 NAMES = {"CULLED": int(CULLED), "PLANE": PLANE, "HEIGHTFIELD": HEIGHTFIELD, "SLACK": SLACK}
-NAMES |= {"BOX": BOX, "REACH": float(REACH)}
+NAMES |= {"BOX": BOX, "FAR": float(FAR)}
 
 
 @wp.kernel
@@ -90,7 +90,7 @@ def _cull_snippet() -> str:
         }
         f.thick = shapes.margin.data[shape] + instances.contact_radius.data[i];
         f.slack = SLACK * far;
-        f.edge = shapes.kind.data[shape] == BOX ? REACH * instances.scale.data[i] : 0.0;
+        f.edge = shapes.kind.data[shape] == BOX ? FAR * instances.scale.data[i] : 0.0;
         f.shape = shape;
         f.bit = 1 << c;
     }

@@ -46,7 +46,7 @@ from softmode.errors import ConfigError, SolverDiverged
 Array = NDArray[np.float64]
 
 _CONSTRAINT = ("row", "partner_row", "shape", "normal", "offset", "stiffness", "dent_compliance", "dent_depth", "onset")
-_CONSTRAINT += ("ridge", "ridge_lead", "friction", "stick", "stick_deep")
+_CONSTRAINT += ("lead", "ridge", "ridge_lead", "friction", "stick", "stick_deep")
 """What a step's point constraints are made of, besides their count: members of the solver's ``PointConstraints``."""
 FLAT = 0.02
 """Turn of a normal [rad] over the size of a body up to which a shape counts as flat: what float32 leaves of a plane."""
@@ -190,7 +190,7 @@ class AdjointReduced:
         self._constraint = {name: self._zeros((step_max, *constraints), kind) for name, kind in kinds.items()}
 
         samples, touched = (step_max, *t.samples.shape.shape), self.solver.model.shape_count > 0
-        kinds = {"shape": int, "gap": wp.float64, "normal": wp.vec3} if touched else {}
+        kinds = {"shape": int, "gap": wp.float64, "normal": wp.vec3, "part": wp.float32} if touched else {}
         self._sample = {name: self._zeros(samples, kind) for name, kind in kinds.items()}
 
         self._sizes = {
@@ -203,7 +203,8 @@ class AdjointReduced:
         }
         of_constraints = (
             "constraint_slip constraint_normal constraint_gain constraint_hessian constraint memory memory_start "
-            "contact_bar normal_bar cell_gradient cell_place cell_spared cell_fade"
+            "contact_bar normal_bar cell_gradient cell_place cell_spared cell_fade edge_gradient edge_place "
+            "part_bar middle_bar"
         )
         axes = {"": "instance point", of_constraints: "instance constraint", "sample_place": "instance sample"}
         self._step = allocate(kernels.Linearised, axes, self._sizes, self.device)
@@ -481,6 +482,7 @@ class AdjointReduced:
         given = (*self._cells, t.constraints, t.arrays.q, costate, dt)
         t.launch(cell_kernels.accumulate_cells, constraints, *given, sums, self._step)
         touched = (t.instances, t.samples, t.surface, t.constraints, self._step)
+        t.launch(cell_kernels.accumulate_parts, constraints, *self._cells, t.constraints, sums, self._step)
         t.launch(cell_kernels.spread_over_neighbours, self.instances, *touched)
         found = (t.instances, t.basis, t.constraints, self._step, wp.float64(dt))
         t.launch(cell_kernels.propagate_cells, t.unknowns, *found, q_bar, qd_bar)

@@ -23,7 +23,6 @@ from softmode.deformables.contact.penalty_kernels import (
     slip_potential,
     stiffness_exponents,
 )
-from softmode.deformables.contact.ridge_kernels import NARROW
 from softmode.deformables.materials.hessian_kernels import stress_derivative
 from softmode.deformables.materials.material_kernels import green_strain, hooke_stress, stress
 from softmode.deformables.model.declare import struct
@@ -54,7 +53,7 @@ class Linearised:
     point: wp.array2d[wp.mat33d]  # V times what is summed over the points next [N m]
     constraint_slip: wp.array2d[wp.vec3d]  # pins: x - target [m]; contacts: -d force / d friction coefficient [N]
     constraint_normal: wp.array2d[wp.vec3d]  # contacts: d force / d normal force
-    constraint_gain: wp.array2d[wp.vec3d]  # contacts: d normal force / d ln of stiffness, dent compliance, edges [N]
+    constraint_gain: wp.array2d[wp.vec2d]  # contacts: d normal force / d ln of stiffness, dent compliance [N]
     constraint_hessian: wp.array2d[wp.mat33d]  # -d force / d displacement [N/m]; not symmetric where a contact slips
     constraint: wp.array2d[wp.vec3d]  # what is summed over the constraints next [N]
     memory: wp.array2d[wp.vec3d]  # what the next step feels of a contact's memory, over the stick stiffness
@@ -64,7 +63,11 @@ class Linearised:
     # and of what the dent along the surface is beside that across
     cell_gradient: wp.array2d[wp.mat33d]  # the loss by the gradient of a cell ahead, and
     cell_place: wp.array2d[wp.vec3d]  # by the sample's place ahead [1/m]
+    part_bar: wp.array2d[wp.float64]  # by ln of the part of the cell that is under a face, but for its neighbours, and
+    middle_bar: wp.array2d[wp.vec3d]  # by the middle of that, at rest [1/m]
     cell_spared: wp.array2d[wp.float64]  # by the share of the neighbourhood that does not touch
+    edge_gradient: wp.array2d[wp.mat33d]  # the loss by the gradient of a cell at the start, and
+    edge_place: wp.array2d[wp.vec3d]  # by the sample's place there, as edges feel them [1/m]
     cell_fade: wp.array2d[wp.vec2d]  # gap at which a neighbour begins to count, and over which it comes to count [m]
     sample_place: wp.array2d[wp.vec3d]  # (instance_count, sample_max), the loss by its place at the start [1/m]
 
@@ -236,10 +239,7 @@ def place_constraints(
     step.constraint_normal[i, e] = n - c * by_limit * t
     by_ratio = -ratio / ((wp.float64(1.0) + ratio) * (wp.float64(1.0) + ratio))
     by_ratio *= plain_slope + after * plain_curvature
-    _edge, edge_slope, _curvature = penalty(p + constraints.ridge_lead[i, e], constraints.onset[i, e])
-    by_edge = edge_slope - plain_slope - (constraints.ridge_lead[i, e] + after) * plain_curvature
-    by_edge *= constraints.ridge[i, e]
-    step.constraint_gain[i, e] = k * wp.vec3d(slope - by_edge + by_ratio, by_ratio, by_edge)
+    step.constraint_gain[i, e] = k * wp.vec2d(slope + by_ratio, by_ratio)
     step.constraint_hessian[i, e] = k * curvature * N + slip - c * k * curvature * by_limit * wp.outer(t, n)
 
 
@@ -546,8 +546,7 @@ def accumulate_constraints(
     steep = beyond_exponent(constraints.stiffness[i, e] * constraints.dent_compliance[i, e])
     dent_powers = steep * dent_exponents(instances, i) + (steep - wp.float64(1.0)) * stiffness_powers
     by = step.constraint_gain[i, e]
-    edge_powers = -dent_exponents(instances, i) - wp.vec4d(none, none, none, NARROW)
-    normal_gain = by[0] * stiffness_powers + by[1] * dent_powers + by[2] * edge_powers
+    normal_gain = by[0] * stiffness_powers + by[1] * dent_powers
     # k_t is that of the spring of friction and of the dent along the surface in series
     stick = constraints.stick[i, e]
     deep = constraints.stick_deep[i, e]
@@ -584,9 +583,6 @@ def accumulate_constraints(
     _origin, rotation = shape_frame(shapes, shape)
     step.memory_start[i, e] = -wp.quat_rotate_inv(rotation, across)
     across += turned_back(shapes, shape, back, dt)
-    if constraints.ridge[i, e] > none:  # how stiff an edge is follows how deep it is at the start
-        edge = constraints.ridge_lead[i, e] - wp.dot(n, constraints.offset[i, e])
-        across -= by_normal * by[2] * NARROW / wp.max(edge, wp.float64(1.0e-9)) * n
     step.constraint[i, e] = across
     # c = sqrt(friction of body * friction of shape)
     if instances.friction[i] > 0.0:

@@ -20,11 +20,22 @@ from softmode.deformables.contact.cell_kernels import (
     fade_of,
     gradient_of,
     neighbour_at,
+    part_of_cell,
     shape_of_cell,
     touched_share,
+    touching,
     write_row,
 )
-from softmode.deformables.contact.detection_kernels import Shapes, curvature_of, motion_of_cell, shape_area
+from softmode.deformables.contact.detection_kernels import (
+    Shapes,
+    box_beside,
+    curvature_of,
+    face_part,
+    motion_of_cell,
+    pressed_by,
+    shape_area,
+)
+from softmode.deformables.contact.face_kernels import part_under_face
 from softmode.deformables.contact.penalty_kernels import (
     BULK_FACTOR,
     HARDENING,
@@ -37,6 +48,7 @@ from softmode.deformables.contact.penalty_kernels import (
     shear_growth,
     stiffness_exponents,
 )
+from softmode.deformables.contact.ridge_kernels import Box, ridge_at
 from softmode.deformables.gradients.adjoint_kernels import Linearised, Sums, turned_back
 from softmode.deformables.model.deformation_kernels import displacement_gradient
 from softmode.deformables.model.lane_kernels import vec8d
@@ -48,6 +60,7 @@ from softmode.deformables.model.struct_kernels import (
     Motion,
     PointConstraints,
     Samples,
+    interpolate,
 )
 
 wp.set_module_options({"enable_backward": False})
@@ -78,6 +91,26 @@ def normal_of(instances: Instances, samples: Samples, i: int, sample: int, shape
 
 
 @wp.func
+def part_of(
+    instances: Instances,
+    basis: Basis,
+    motion: Motion,
+    shapes: Shapes,
+    samples: Samples,
+    i: int,
+    sample: int,
+    shape: int,
+):
+    """Return the part of a cell that lies under a face of a shape, and its middle at rest [m]."""
+    s = sample - instances.row_start[i]
+    part = wp.float64(samples.part[i, s, slot_of(samples, i, s, shape)])
+    middle = wp.vec3d()
+    if part < wp.float64(1.0):
+        _box, _frame, _axis, _part, middle = face_part(instances, basis, motion, shapes, samples, i, sample, shape)
+    return part, middle
+
+
+@wp.func
 def cell_loss(
     shape: CellShape,
     F: wp.mat33d,
@@ -92,6 +125,28 @@ def cell_loss(
     """Return the loss to first order in what ``cell_at`` returns."""
     cell = cell_at(shape, F, n, gap, closing, ratio)
     return onset_bar * cell.onset + lead_bar * cell.lead + wp.dot(centre_bar, cell.centre)
+
+
+@wp.func
+def part_loss(box: Box, part_bar: wp.float64, middle_bar: wp.vec3d):
+    """Return the loss to first order in the part of a cell under a face, by its ln, and in the middle of that."""
+    _axis, part, middle = part_under_face(box)
+    return part_bar * wp.log(part) + wp.dot(middle_bar, middle)
+
+
+@wp.func
+def edge_loss(
+    box: Box,
+    face: wp.float64,
+    onset: wp.float64,
+    least: wp.float64,
+    ridge_bar: wp.float64,
+    lead_bar: wp.float64,
+    normal_bar: wp.vec3d,
+):
+    """Return the loss to first order in what ``ridge_at`` returns."""
+    ridge, lead, normal = ridge_at(box, face, onset, least)
+    return ridge_bar * ridge + lead_bar * lead + wp.dot(normal_bar, normal)
 
 
 @wp.func
@@ -133,6 +188,9 @@ def accumulate_cells(
     step.cell_gradient[i, e] = wp.mat33d()
     step.cell_place[i, e] = wp.vec3d()
     step.cell_spared[i, e] = wp.float64(0.0)
+    step.edge_gradient[i, e] = wp.mat33d()
+    step.edge_place[i, e] = wp.vec3d()
+    step.part_bar[i, e] = wp.float64(0.0)
     if e < instances.pin_count[i] or e >= constraints.count[i]:
         return
     zero = wp.float64(0.0)
@@ -146,19 +204,18 @@ def accumulate_cells(
     p = -wp.dot(n, constraints.offset[i, e] + constraints.displacement[i, e])
     deep = HARDENING_RANGE * eps
     ratio = k * constraints.dent_compliance[i, e]
-    share = wp.float64(1.0) / (wp.float64(1.0) + ratio)
     ridge = constraints.ridge[i, e]
-    beside, after = beside_ridge(ratio, ridge, constraints.ridge_lead[i, e])
-    _psi, _slope, curvature = penalty(p - after, eps)
+    ridge_lead = constraints.ridge_lead[i, e]
+    beside, after = beside_ridge(ratio, ridge, ridge_lead)
+    _psi, slope, curvature = penalty(p - after, eps)
     _deep_psi, _deep_slope, deep_curvature = penalty(p - depth, deep)
     steep = HARDENING * deep_curvature
     force_bar = k * step.normal_bar[i, e][0]
     onset_bar = HARDENING_RANGE * HARDENING * by_onset(p - depth, deep)
-    edge = p + constraints.ridge_lead[i, e]
-    _edge_psi, _edge_slope, edge_curvature = penalty(edge, eps)
-    onset_bar += ridge * (by_onset(edge, eps) + half * (edge_curvature - curvature))  # edges lead by half of it
+    _edge_psi, edge_slope, edge_curvature = penalty(p + ridge_lead, eps)
+    onset_bar += ridge * by_onset(p + ridge_lead, eps)
     onset_bar = force_bar * (onset_bar + beside * by_onset(p - after, eps))
-    lead_bar = force_bar * (share * curvature + steep)
+    lead_bar = force_bar * (beside * curvature + ridge * edge_curvature + steep)
     depth_bar = step.normal_bar[i, e][2] - force_bar * steep * depth
 
     face = normal_of(instances, samples, i, row, shape)
@@ -166,6 +223,10 @@ def accumulate_cells(
     gap = gap_of(instances, samples, i, row, shape)
     other = curvature_of(shapes, shape, face)
     cell_shape = shape_of_cell(surface, instances, basis, i, row, other)
+    part, middle = part_of(instances, basis, motion, shapes, samples, i, row, shape)
+    cut = part_of_cell(cell_shape, part)
+    open_gap = gap + wp.dot(face, start * middle)
+    closing += wp.dot(face, (ahead - start) * middle)
     back = step.contact_bar[i, e]
     along = wp.dot(n, back)
     centre_bar = wp.vec3d()
@@ -173,18 +234,60 @@ def accumulate_cells(
         moved = gradient_of(instances, basis, q, i, row) - start
         pulled = displacement_gradient(basis.row_gradient, costate, i, row, instances.function_count[i])
         centre_bar = wp.transpose(pulled) * constraints.force[i, e] - wp.transpose(moved) * back
-        centre_bar += along * (wp.transpose(ahead - start) * face)
         centre_bar += wp.transpose(start) * turned_back(shapes, shape, back, dt)
+    middle_bar = centre_bar - along * (wp.transpose(start) * face)
+    centre_bar += along * (wp.transpose(ahead - start) * face)
+    give_bar = zero
+    by_unit = zero
+    by_length = zero
+    if ridge > zero:
+        dent = instances.scale[i] * surface.dent_length[row]
+        box, frame, _beside = box_beside(instances, basis, motion, shapes, samples, i, row, shape, face, gap, dent)
+        box = pressed_by(box, instances, surface, i, row, k, ratio)
+        # a force turns with its normal if the displacement does too; of that the gap alone lies along the normal
+        x = constraints.offset[i, e] + constraints.displacement[i, e]
+        f = constraints.force[i, e]
+        memory = step.memory[i, e]
+        L = interpolate(basis.row, constraints.row[i, e], costate, i, instances.function_count[i]) - memory
+        turned = wp.cross(f, L) + wp.cross(x, back) + wp.dot(n, f) * wp.cross(n, memory)
+        normal_bar = wp.cross(turned, n)
+        start_gap = wp.dot(n, constraints.offset[i, e])
+        normal_bar += along * (constraints.offset[i, e] - start_gap * n) - start_gap * back
+        by_box, by_face, by_range, by_least, _r, _d, _n = wp.grad(edge_loss)(
+            box,
+            constraints.lead[i, e] - gap,
+            eps,
+            cell_shape.least,
+            force_bar * (edge_slope - slope - (ridge_lead + after) * curvature),
+            force_bar * ridge * (edge_curvature - curvature),
+            wp.transpose(frame) * normal_bar,
+        )
+        onset_bar += by_range
+        lead_bar += by_face
+        give_bar = by_box.give
+        step.edge_gradient[i, e] = frame * by_box.F
+        step.edge_place[i, e] = frame * by_box.x - by_face * face + along * (n - face)
+        by_unit = by_box.unit * box.unit
+        by_length = wp.float64(2.0) * by_box.area * box.area + by_box.reach * box.reach + by_box.dent * box.dent
+        by_length += by_least * cell_shape.least - by_unit
     by_shape, by_F, _by_n, _by_gap, by_place, by_ratio, _o, _l, _c = wp.grad(cell_loss)(
-        cell_shape, ahead, face, gap, closing, ratio, onset_bar, lead_bar, centre_bar
+        cut, ahead, face, open_gap, closing, ratio, onset_bar, lead_bar, centre_bar
     )
     fade_shape, fade_F, _fade_n = wp.grad(fade_of)(cell_shape, ahead, face)
-    cell = cell_at(cell_shape, ahead, face, gap, closing, ratio)
+    cell = cell_at(cut, ahead, face, open_gap, closing, ratio)
+    if part < wp.float64(1.0):
+        middle_bar += by_place * (wp.transpose(ahead) * face)
+        by_F += by_place * wp.outer(face, middle)
+        pressed = interpolate(basis.row, constraints.row[i, e], costate, i, instances.function_count[i])
+        part_bar = wp.dot(pressed, constraints.force[i, e])
+        part_bar += by_shape.bend * cut.bend + wp.ddot(by_shape.moments, cut.moments)
+        step.part_bar[i, e] = part_bar
+        step.middle_bar[i, e] = middle_bar
     fade = fade_of(cell_shape, ahead, face)
     touched = zero
     spared = zero  # or one, far away: either does not change
     if gap <= NEAR * cell_shape.steepest:
-        touched = touched_share(surface, samples.shape, samples.gap, cell_shape, fade, i, row, shape)
+        touched = touched_share(surface, samples.shape, samples.gap, samples.part, cell_shape, fade, i, row, shape)
         spared = wp.float64(1.0) - touched * touched
     by_gap = zero
     by_fade = zero
@@ -193,12 +296,12 @@ def accumulate_cells(
         for slot in range(SLOTS):
             if samples.shape[i, t, slot] == shape:
                 y = neighbour_at(cell_shape, fade, samples.gap[i, t, slot])
-                change = wp.float64(surface.weight[m]) * slope_of_touching(y) / fade
+                change = wp.float64(surface.weight[m] * samples.part[i, t, slot]) * slope_of_touching(y) / fade
                 by_gap += change
                 by_fade -= (wp.float64(1.0) - y) * change
 
     exponent = beyond_exponent(ratio)
-    by_log = by_ratio * ratio * exponent
+    by_log = (by_ratio + give_bar) * ratio * exponent
     spared_bar = zero
     if spared > zero:
         own = depth_bar * (wp.float64(1.0) - HARDENING_DEPTH * cell_shape.least / depth)  # a part no dent shifts
@@ -210,11 +313,12 @@ def accumulate_cells(
     fade_bar = spared_bar * by_fade
     step.cell_gradient[i, e] = by_F + fade_bar * fade_F + along * wp.outer(face, cell.centre)
     step.cell_place[i, e] = by_place * face
+    step.edge_gradient[i, e] = step.edge_gradient[i, e] + along * wp.outer(n - face, cell.centre)
 
     # lengths grow with the scale, but not the radius of what is touched
     above = half * spared_bar * by_gap
-    bend_bar = by_shape.bend + fade_bar * fade_shape.bend + above
-    by_scale = depth_bar + fade_bar * fade_shape.fade * cell_shape.fade
+    bend_bar = part * by_shape.bend + fade_bar * fade_shape.bend + above
+    by_scale = by_length + depth_bar + fade_bar * fade_shape.fade * cell_shape.fade
     by_scale += (by_shape.steepest + fade_bar * fade_shape.steepest) * cell_shape.steepest
     by_scale += (by_shape.least - above) * cell_shape.least
     if cell_shape.bend > zero:
@@ -222,8 +326,48 @@ def accumulate_cells(
         by_scale += bend_bar * (cell_shape.bend + wp.float64(area * other) / (wp.float64(2.0) * PI))
     firm = surface.relative_stiffness[row] * surface.slenderness[row]
     powers = stiffness_exponents(instances, i, BULK_FACTOR, firm, shape_area(shapes, shape), dt)
-    powers = by_log * (powers + dent_exponents(instances, i))
+    powers = (by_log - by_unit) * (powers + dent_exponents(instances, i))
     sums.contact[i, e] = sums.contact[i, e] + powers + wp.vec4d(zero, by_shape.poissons_ratio, zero, by_scale)
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def accumulate_parts(
+    instances: Instances,
+    basis: Basis,
+    motion: Motion,
+    shapes: Shapes,
+    samples: Samples,
+    surface: Surface,
+    constraints: PointConstraints,
+    # In and out:
+    sums: Sums,
+    step: Linearised,
+):
+    """Pass the loss by the parts of cells under faces, which their neighbours count too, to what they follow."""
+    i, e = wp.tid()
+    if e < instances.pin_count[i] or e >= constraints.count[i]:
+        return
+    row = constraints.partner_row[i, e]
+    shape = constraints.shape[i, e]
+    s = row - instances.row_start[i]
+    slot = slot_of(samples, i, s, shape)
+    if samples.part[i, s, slot] == 1.0:
+        return
+    part_bar = step.part_bar[i, e]
+    for other in range(instances.pin_count[i], constraints.count[i]):
+        near = constraints.partner_row[i, other]
+        if constraints.shape[i, other] == shape and step.cell_spared[i, other] != wp.float64(0.0):
+            for m in range(surface.start[near], surface.start[near + 1]):
+                if surface.neighbour[m] == s:
+                    y = (step.cell_fade[i, other][0] - samples.gap[i, s, slot]) / step.cell_fade[i, other][1]
+                    counted = wp.float64(surface.weight[m] * samples.part[i, s, slot]) * touching(y)
+                    part_bar -= step.cell_spared[i, other] * counted
+    rim, turn, _axis, _part, _middle = face_part(instances, basis, motion, shapes, samples, i, row, shape)
+    by_rim, _by_part, _by_middle = wp.grad(part_loss)(rim, part_bar, step.middle_bar[i, e])
+    step.edge_gradient[i, e] = step.edge_gradient[i, e] + turn * by_rim.F
+    step.edge_place[i, e] = step.edge_place[i, e] + turn * by_rim.x
+    by_scale = wp.float64(2.0) * by_rim.area * rim.area
+    sums.contact[i, e] = sums.contact[i, e] + wp.vec4d(wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), by_scale)
 
 
 @wp.kernel
@@ -246,11 +390,14 @@ def restore_rows(
         return
     shape = constraints.shape[i, e]
     n = normal_of(instances, samples, i, row, shape)
-    _start, ahead, closing = motion_of_cell(instances, basis, motion, shapes, samples, i, row, shape, n, dt)
+    start, ahead, closing = motion_of_cell(instances, basis, motion, shapes, samples, i, row, shape, n, dt)
     cell_shape = shape_of_cell(surface, instances, basis, i, row, curvature_of(shapes, shape, n))
+    part, middle = part_of(instances, basis, motion, shapes, samples, i, row, shape)
+    gap = gap_of(instances, samples, i, row, shape) + wp.dot(n, start * middle)
+    closing += wp.dot(n, (ahead - start) * middle)
     ratio = constraints.stiffness[i, e] * constraints.dent_compliance[i, e]
-    cell = cell_at(cell_shape, ahead, n, gap_of(instances, samples, i, row, shape), closing, ratio)
-    write_row(basis, constraints.row[i, e], row, cell.centre)
+    cell = cell_at(part_of_cell(cell_shape, part), ahead, n, gap, closing, ratio)
+    write_row(basis, constraints.row[i, e], row, cell.centre + middle)
 
 
 @wp.kernel
@@ -275,8 +422,10 @@ def spread_over_neighbours(
             for slot in range(SLOTS):
                 if samples.shape[i, t, slot] == constraints.shape[i, e]:
                     y = (step.cell_fade[i, e][0] - samples.gap[i, t, slot]) / step.cell_fade[i, e][1]
-                    change = wp.float64(surface.weight[m]) * step.cell_spared[i, e] * slope_of_touching(y)
-                    pull = change / step.cell_fade[i, e][1] * constraints.normal[i, e]
+                    weight = wp.float64(surface.weight[m] * samples.part[i, t, slot])
+                    change = weight * step.cell_spared[i, e] * slope_of_touching(y)
+                    normal = normal_of(instances, samples, i, instances.row_start[i] + t, constraints.shape[i, e])
+                    pull = change / step.cell_fade[i, e][1] * normal
                     step.sample_place[i, t] = step.sample_place[i, t] + pull
 
 
@@ -297,12 +446,14 @@ def propagate_cells(
     b = e % stride
     axis = e / stride
     ahead = vec8d()
+    start = vec8d()
     for k in range(instances.pin_count[i], constraints.count[i]):
         row = constraints.partner_row[i, k]
+        start = start + step.edge_place[i, k][axis] * vec8d(basis.row[row, b])
         ahead = ahead + step.cell_place[i, k][axis] * vec8d(basis.row[row, b])
         for j in range(3):
             ahead = ahead + step.cell_gradient[i, k][axis, j] * vec8d(basis.row_gradient[b, row, j])
-    start = vec8d()
+            start = start + step.edge_gradient[i, k][axis, j] * vec8d(basis.row_gradient[b, row, j])
     for s in range(instances.sample_count[i]):
         start = start + step.sample_place[i, s][axis] * vec8d(basis.row[instances.row_start[i] + s, b])
     q_bar[i, e] = q_bar[i, e] + ahead + start

@@ -4,7 +4,7 @@ import warp as wp
 
 from softmode.deformables.contact.detection_kernels import Shapes, shape_frame
 from softmode.deformables.contact.shape_query_kernels import HEIGHTFIELD, PLANE, query_heightfield, query_shape
-from softmode.deformables.model.struct_kernels import Instances, PointConstraints, Samples
+from softmode.deformables.model.struct_kernels import SLOTS, Instances, PointConstraints, Samples
 
 wp.set_module_options({"enable_backward": False})
 
@@ -34,6 +34,9 @@ def find_turning(
         return
     origin, rotation = shape_frame(shapes, shape)
     s = constraints.partner_row[i, e] - instances.row_start[i]
+    for slot in range(SLOTS):
+        if samples.constraint[i, s, slot] == e and samples.part[i, s, slot] < 1.0:
+            return  # the normal is that of a face, beside it too
     x = wp.vec3(wp.quat_rotate_inv(rotation, samples.position[i, s] - origin))
     n = wp.vec3(wp.quat_rotate_inv(rotation, constraints.normal[i, e]))
     across = wp.vec3()

@@ -386,6 +386,7 @@ class Samples:
     shape: wp.array3d[int]  # (..., SLOTS), -1 where empty
     gap: wp.array3d[wp.float64]  # (..., SLOTS) [m]
     normal: wp.array3d[wp.vec3]  # (..., SLOTS)
+    part: wp.array3d[float]  # (..., SLOTS), of the sample's cell what lies under a face
     constraint: wp.array3d[int]  # (..., SLOTS), the point constraint it became, -1 for none
     lower: wp.array[wp.vec3]  # (instance_count,) bounds, grown by margin and drift [m]
     upper: wp.array[wp.vec3]

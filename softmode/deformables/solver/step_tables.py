@@ -70,7 +70,7 @@ _POINTS = {"": "instance point", "hessian": "instance 6 point"}
 _MOTION = {"": "instance unknown", "rate": "instance"}
 _SAMPLES = {
     "position drift near": "instance sample",
-    "shape gap normal constraint": "instance sample slot",
+    "shape gap normal part constraint": "instance sample slot",
     "lower upper drift_lower drift_upper": "instance",
     "reach": "instance team 4",
     "tally": "instance team 2",
