@@ -118,7 +118,7 @@ def with_robot(config: Config, robot: Robot) -> Config:
         scene,
         arm=robot,
         control=control,
-        constraint_max=max(scene.constraint_max, 64) + 2 * more,
+        constraint_max=scene.constraint_max + 2 * more,
         rigid_contact_max=max(scene.rigid_contact_max, 64) + 3 * shapes,  # pairs that come near count as well
     )
     if config.samples_for_tips:

@@ -104,9 +104,14 @@ class ScriptedPolicy:
         return self.scene.object_velocity.numpy()[self.world, self.target].astype(float)
 
     @property
+    def finger_forces(self) -> Vector:
+        """Force on each finger [N]."""
+        return np.linalg.norm(self.scene.finger_force.numpy()[self.world], axis=1)
+
+    @property
     def weaker_force(self) -> np.floating:
         """Force on the finger that feels less [N]."""
-        return np.linalg.norm(self.scene.finger_force.numpy()[self.world], axis=1).min()
+        return self.finger_forces.min()
 
     def segment(self, name: str) -> Vector:
         """Return a segment of the observation vector."""
@@ -148,14 +153,16 @@ class ScriptedPolicy:
     def regulated(self, grip: float, wanted: float, *, closing: float, holding: float) -> float:
         """Return the gripper's next entry: it closes while the weaker finger feels too little, and opens otherwise.
 
+        It does not close on what presses on the other finger alone, such as a rope that is caught at a peg.
+
         Args:
             grip: The last entry.
             wanted: Force of each finger [N].
             closing: Greatest change while a finger touches nothing.
             holding: Greatest change while both touch.
         """
-        force = self.weaker_force
-        error = np.clip((wanted - force) / wanted, -1.0, 1.0)
+        force, most = self.weaker_force, self.finger_forces.max()
+        error = np.clip((wanted - force) / wanted, -1.0, 1.0 if most < 3.0 * wanted else 0.0)
         return float(np.clip(grip - (closing if force < TOUCH_FORCE else holding) * error, -1.0, 1.0))
 
 

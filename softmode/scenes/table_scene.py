@@ -85,7 +85,7 @@ class TableSceneConfig:
     """Physics steps per control step; even."""
     table_friction: float = 0.8
     """Coulomb coefficient of the table."""
-    constraint_max: int = 64
+    constraint_max: int = 96
     """Rows of MuJoCo's constraints per world."""
     rigid_contact_max: int = 32
     """Contacts between rigid shapes per world."""

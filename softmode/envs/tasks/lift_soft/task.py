@@ -31,7 +31,6 @@ def lift_scene() -> TableSceneConfig:
     return rl_scene(
         TableSceneConfig(
             object=ObjectConfig(surface_count=200),
-            constraint_max=96,
             arm=ArmDescription(home_position=(0.45, 0.0, 0.17)),
         )
     )

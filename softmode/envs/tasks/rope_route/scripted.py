@@ -26,9 +26,11 @@ class ScriptedRope(ScriptedPolicy):
 
     CLEARANCE = 0.03
     """Height over the rope from which the gripper goes down [m]."""
-    BESIDE = 0.05
+    BESIDE = 0.065
     """Distance at which the tool passes a peg's axis [m]."""
-    LEAD = 0.007
+    NEAREST = 0.06
+    """Least distance from an axis that it has passed, unless its goal is nearer [m]: the rope is caught there."""
+    LEAD = 0.006
     """Way of the tool per control step while it leads the rope [m]."""
     RISE = 0.006
     """Height by which the rope's end is lifted while it is led [m]."""
@@ -36,7 +38,7 @@ class ScriptedRope(ScriptedPolicy):
     task_class = RopeRoute
     task: RopeRoute
 
-    def __init__(self, env: Environment, *, world: int = 0, squeeze: float = 4.0) -> None:
+    def __init__(self, env: Environment, *, world: int = 0, squeeze: float = 3.0) -> None:
         """Remember the environment and plan nothing yet."""
         super().__init__(env, world=world)
         self._squeeze = squeeze
@@ -75,7 +77,7 @@ class ScriptedRope(ScriptedPolicy):
         else:
             self._count = self._count + 1 if force < TOUCH_FORCE else 0
             self._regulate()
-            goal, fastest = np.array([*self._next(tool, end), lowest + self.RISE]), self.LEAD
+            goal = np.array([*self._next(tool, end), lowest + self.RISE])
             if self._count > 5:
                 self.reset()
                 goal = tool
@@ -86,15 +88,21 @@ class ScriptedRope(ScriptedPolicy):
         self._phase, self._count = phase, 0
 
     def _next(self, tool: Vector, end: Vector) -> Vector:
-        """Return where the tool is to go: beside the next peg, at last to where the end is at the goal."""
+        """Return where the tool goes next: to the next peg's side, at last to where the end is at the goal."""
         sides, goal = self.segment("side"), self.segment("goal")
         pegs = [np.array(peg.position[:2]) for peg in self.task.config.pegs]
-        while self._passed < len(pegs):
-            beside = pegs[self._passed] + np.array([sides[self._passed] * self.BESIDE, 0.0])
+        there, fraction = tool[:2] + goal - end[:2], 0.3
+        for k in range(self._passed, len(pegs)):
+            beside = pegs[k] + np.array([sides[k] * self.BESIDE, 0.0])
             if np.linalg.norm(beside - tool[:2]) > 0.01:
-                return beside
+                there, fraction = beside, 1.0
+                break
             self._passed += 1
-        return tool[:2] + 0.3 * (goal - end[:2])
+        place: Vector = tool[:2] + bounded(fraction * (there - tool[:2]), self.LEAD)
+        for axis in pegs[: self._passed]:
+            away, nearest = place - axis, min(self.NEAREST, float(np.linalg.norm(there - axis)))
+            place = axis + away * max(1.0, nearest / float(np.linalg.norm(away)))
+        return place
 
     def _regulate(self) -> None:
         """Close while the weaker finger feels too little, open while it feels too much."""
