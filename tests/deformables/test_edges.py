@@ -10,7 +10,7 @@ from softmode.deformables.contact.ridge_kernels import RIDGE
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body
 from tests import reference
-from tests.bodies import default_cube
+from tests.bodies import cube, default_cube
 from tests.deformables.probe_kernels import evaluate_ridges
 from tests.scenes import Scene
 
@@ -70,6 +70,38 @@ class Edged:
             self.scene.restart()
             found.append(self.force(depth, place))
         return np.array(found) / np.array(list(expected.values()))
+
+
+def test_a_face_hardly_wider_than_a_cell() -> None:
+    """Two fingers of 25 mm on a cube with cells of 20 mm press alike, about their middles, wherever samples lie.
+
+    Forces within 5 % of their mean, centres of pressure within 2 mm. With whole cells, pressed where their samples
+    are, one to four of them count.
+    """
+    half = 0.0125
+
+    def populate(world: newton.ModelBuilder) -> None:
+        material = Material(youngs_modulus=MODULUS, density=300.0, friction=0.0, mass_damping=50.0)
+        add_reduced_body(world, cube(), material=material)
+        for _ in range(2):
+            world.add_shape_box(world.add_body(is_kinematic=True), hx=half, hy=half, hz=PLATE)
+
+    scene, found = Scene(populate, [cube()], dt=0.01), []
+    for place in ((0.0, 0.0), (0.004, 0.007), (-0.009, 0.003), (0.01, 0.01)):
+        scene.restart()
+        poses = np.zeros((2, 7), dtype=np.float32)
+        poses[:, :2], poses[:, 2], poses[:, 6] = place, (0.5 * EDGE + PLATE - 0.001) * np.array([-1.0, 1.0]), 1.0
+        for state in (scene.state, scene.next_state):
+            state.body_q.assign(poses)
+        scene.step(40)
+        constraints = scene.reduced.view.constraints
+        count = int(constraints.count.numpy()[0])
+        force, arm = constraints.force.numpy()[0, :count, 2], constraints.arm.numpy()[0, :count, :2]
+        up = force > 0.0
+        found.append(force[up].sum())
+        centre = force[up] @ arm[up] / force[up].sum()
+        assert np.abs(centre).max() < 0.002, (place, centre)
+    np.testing.assert_allclose(found, np.mean(found), rtol=0.05)
 
 
 def test_wedge() -> None:

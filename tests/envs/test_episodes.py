@@ -17,7 +17,7 @@ LIMITS = {
     "LiftSoft": (9.0, 0.52),
     "PushSoft": (0.7, 0.41),
     "PressSoft": (6.6, 0.5),
-    "RopeRoute": (19.7, 1.4),
+    "RopeRoute": (17.8, 0.68),
     "ShapeSoft": (0.92, 2.0),
     "PlaceInBin": (2.4, 0.62),
 }

@@ -435,15 +435,16 @@ def find_contacts(
         if kind == HEIGHTFIELD:
             query = query_heightfield(local, shapes.fields, shapes.fields.index[shape], far)
         query.distance -= thick
+        depth = instances.scale[i] * float(wp.length(basis.inner_point[row]))
         part = float(1.0)
         if kind == BOX and query.distance < wp.max(reach, FAR * side):
             box, _frame, axis, under, _middle = face_part(instances, basis, motion, shapes, samples, i, row, shape)
             level = float(1.0e30)
             if axis >= 0:
                 level = float(wp.abs(box.x[axis]) - box.half[axis])
-            # beside a flank no deeper than a step may start
+            # beside a flank no deeper than a step may start, nor than half way to the middle of a thin body
             nearest = wp.abs(query.distance - level) < 1.0e-6
-            if level < reach and (nearest or level > -OVERLAP * instances.size[i]):
+            if level < reach and (nearest or level > -wp.min(OVERLAP * instances.size[i], 0.5 * depth)):
                 part = float(under)
                 query.distance = level
                 query.normal = wp.vec3()
@@ -452,7 +453,6 @@ def find_contacts(
         along = wp.vec3()
         end = float(0.0)
         back = int(0)
-        depth = instances.scale[i] * float(wp.length(basis.inner_point[row]))
         travel = wp.length(drift)
         touched = stuck[0] == shape or stuck[1] == shape or dt_before[i] == wp.float64(0.0)
         if part == 1.0 and (query.distance <= 0.0 or (touched and query.distance < 2.0 * depth)):
