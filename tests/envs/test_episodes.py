@@ -16,10 +16,10 @@ from tests.envs.conftest import Episodes, MakeEnv
 LIMITS = {
     "LiftSoft": (9.0, 0.52),
     "PushSoft": (0.7, 0.41),
-    "PressSoft": (8.0, 1.05),
+    "PressSoft": (6.6, 0.5),
     "RopeRoute": (19.7, 1.4),
     "ShapeSoft": (0.92, 2.0),
-    "PlaceInBin": (2.4, 0.25),
+    "PlaceInBin": (2.4, 0.62),
 }
 """Largest force on a rigid body [N] and depth in it besides the dent [mm]: 1.5 times those of the episode."""
 

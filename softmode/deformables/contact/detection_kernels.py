@@ -441,7 +441,9 @@ def find_contacts(
             level = float(1.0e30)
             if axis >= 0:
                 level = float(wp.abs(box.x[axis]) - box.half[axis])
-            if level > -0.3 * OVERLAP * instances.size[i] and level < reach:
+            # beside a flank no deeper than a step may start
+            nearest = wp.abs(query.distance - level) < 1.0e-6
+            if level < reach and (nearest or level > -OVERLAP * instances.size[i]):
                 part = float(under)
                 query.distance = level
                 query.normal = wp.vec3()
