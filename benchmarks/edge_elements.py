@@ -108,7 +108,7 @@ def corner(across: int, along: int, deep: int) -> Array:
 
 
 def tips(under: int, beside: int, deep: int) -> Array:
-    """Return the forces of a flat punch, its nodes those that lie under it at rest: a quarter of the block is solved."""
+    """Return the forces of a flat punch on the nodes under it at rest: a quarter of the block is solved."""
     half, width = (0.3, 0.15), 0.5 * np.sqrt(np.pi) * 0.75
 
     def graded(rim: float) -> Array:
