@@ -58,6 +58,9 @@ BOXES = {
     "pad": (0.1, 0.1, 0.02),
     "sheet of 4 mm": (0.1, 0.1, 0.004),
 }
+TIPS = {0.01: 0.006182, 0.02: 0.012216, 0.03: 0.018090, 0.05: 0.029284}
+"""Force of finger tips on PressSoft's pad over E height^2 by depth over height: `edge_elements`; a block as wide as the
+pad has up to 2 % more."""
 TASKS = (
     *("PushSoft puck", "PressSoft pad", "ShapeSoft post", "RopeRoute rope", "PlaceInBin die", "PlaceInBin ball"),
     *("PlaceInBin disc", "LiftSoft beam"),
@@ -162,6 +165,34 @@ def task_face(name: str, strain: float) -> Figure:
     else:
         expected = uniaxial(strain, modulus, ratio) * body.volume / size
     return force / expected, status
+
+
+def tips(depth: float) -> Figure:
+    """Press the closed tips of fingers into PressSoft's pad without friction, on the mean over three places."""
+    body, material = of_task("PressSoft pad")
+    still, height = replace(material, poissons_ratio=0.3, friction=0.0, mass_damping=100.0), 0.04
+
+    def populate(world: newton.ModelBuilder) -> None:
+        add_reduced_body(world, body, material=still, position=tuple(-body.bounds.mean(axis=0)))
+        below = wp.transform(wp.vec3(0.0, 0.0, -0.5 * height - 0.02), wp.quat_identity())
+        world.add_shape_box(-1, xform=below, hx=0.1, hy=0.1, hz=0.02)
+        hand = world.add_body(is_kinematic=True)
+        for side in (-1.0, 1.0):
+            finger = wp.transform(wp.vec3(0.0, 0.003 * side, 0.0), wp.quat_identity())
+            world.add_shape_box(hand, xform=finger, hx=0.012, hy=0.003, hz=0.022)
+
+    scene, found = Scene(populate, [body], dt=0.01), []
+    for place in ((0.0, 0.0), (0.002, 0.001), (-0.003, 0.002)):
+        scene.restart()
+        pose = np.array([[*place, 0.022 + (0.5 - depth) * height, 0.0, 0.0, 0.0, 1.0]], dtype=np.float32)
+        for state in (scene.state, scene.next_state):
+            state.body_q.assign(pose)
+        scene.step(60)
+        constraints = scene.reduced.view.constraints
+        force = constraints.force.numpy()[0, : int(constraints.count.numpy()[0]), 2]
+        found.append(-np.minimum(force, 0.0).sum())
+    expected = TIPS[depth] * material.youngs_modulus * height**2
+    return float(np.mean(found)) / expected, int(scene.reduced.status.numpy()[0])
 
 
 def rod(radius: float, strain: float, material: Material) -> float:
@@ -404,6 +435,8 @@ def cases() -> Iterator[Case]:
         yield Case(f"whole face, {name}", f"{name}, nu {ratio}, {strain:.0%}", low, 1.05, face, (name, ratio, strain))
     for name, strain in itertools.product(TASKS, (0.01, 0.04, 0.1)):
         yield Case(f"between plates, {name}", f"{name}, {strain:.0%}", 0.9, 1.1, task_face, (name, strain))
+    for depth in TIPS:
+        yield Case("finger tips, PressSoft pad", f"{depth:.0%} deep", 0.9, 1.1, tips, (depth,))
     for modulus, ratio, share in itertools.product((1.0e5, 1.0e6), (0.3, 0.45, 0.49), (0.01, 0.02, 0.04, 0.08)):
         name = f"{share:.0%} of R, E {modulus:g}, nu {ratio}"
         yield Case(f"Hertz, {share:.0%} of R", name, 0.93, 1.07, ball, (modulus, ratio, share))

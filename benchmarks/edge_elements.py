@@ -5,6 +5,8 @@ without friction, on two meshes each (about ten minutes):
 
 - wedge: a rigid edge of 90 degrees across the middle of the upper face of a cube that stands on a plate,
 - corner: a corner of a rigid box there, its three faces alike;
+- tips: the closed tips of the arm's fingers, 24 by 12 mm, on a block as high as PressSoft's pad and as wide, over its
+  height of 40 mm, which stands on a plate;
 - own edge, own corner: the cube itself between two plates that press opposite edges or corners, each so deep.
 
 Elements and material are those of `hertz_elements`. Nodes are kept out of the rigid body by a penalty a thousand times
@@ -38,7 +40,12 @@ def main() -> None:
     argparse.ArgumentParser(description=__doc__).parse_args()
     print("force over E edge^2 at depths over the edge of", *DEPTHS)
     cases = ((wedge, (18, 5, 16), (26, 6, 22)), (corner, (7, 7, 9), (9, 8, 11)))
-    for case, *meshes in (*cases, (own_edge, (12, 3), (20, 4)), (own_corner, (16,), (22,))):
+    for case, *meshes in (
+        *cases,
+        (tips, (8, 6, 12), (11, 8, 14)),
+        (own_edge, (12, 3), (20, 4)),
+        (own_corner, (16,), (22,)),
+    ):
         for counts in meshes:
             print(case.__name__, *counts, *(f"{force:.6f}" for force in case(*counts)), flush=True)
 
@@ -98,6 +105,22 @@ def corner(across: int, along: int, deep: int) -> Array:
     held[index[across, 0, 0], 0] = True
     top = (*face(index, lines, 2, -1), lambda depth: (normals, normals[:, 2] * (1.0 - depth)))
     return -2.0 * press(x, corners, only(x, held), [top])[:, 2]
+
+
+def tips(under: int, beside: int, deep: int) -> Array:
+    """Return the forces of a flat punch on the nodes under it at rest: a quarter of the block is solved."""
+    half, width = (0.3, 0.15), 0.5 * np.sqrt(np.pi) * 0.75
+
+    def graded(rim: float) -> Array:
+        return np.concatenate([rim - rim * line(under)[::-1], rim + (width - rim) * line(beside)[1:]])
+
+    lines = (graded(half[0]), graded(half[1]), 1.0 - line(deep)[::-1])
+    x, index, corners = grid(lines)
+    nodes, area = face(index, lines, 2, -1)
+    pressed = np.all(x[nodes, :2] < np.array(half) + 1.0e-9, axis=1)
+    down = np.array([[0.0, 0.0, -1.0]])
+    top = (nodes[pressed], area[pressed], lambda depth: (down, np.array([depth - 1.0])))
+    return -4.0 * press(x, corners, only(x, x < 1.0e-9), [top])[:, 2]
 
 
 def own_edge(across: int, along: int) -> Array:

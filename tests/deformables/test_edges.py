@@ -114,15 +114,15 @@ def test_wedge() -> None:
 
 @pytest.mark.rest
 def test_corner() -> None:
-    """A corner, 2 to 5 % deep, on the mean over four places: 0.1; 0.25 at 2 %, where its patch lies in one cell."""
+    """A corner, 2 to 5 % deep, on the mean over four places: 0.1, also where its patch lies in one cell."""
     edged = Edged("corner")
     mean = np.mean([edged.ratios(CORNER, place) for place in PLACES], axis=0)
-    assert np.all(np.abs(mean - 1.0) < (0.25, 0.1, 0.1))
+    assert mean == pytest.approx(1.0, abs=0.1)
 
 
 @pytest.mark.parametrize("kind", ["corner", pytest.param("wedge", marks=pytest.mark.rest)])
 def test_along_a_path(kind: str) -> None:
-    """3 % deep at places 1 mm apart: mean within 0.1, places within 0.2; neighbours differ by 0.1, of an edge by 0.15.
+    """3 % deep at places 1 mm apart: mean within 0.1, places within 0.2; neighbours differ by 0.1, of an edge by 0.12.
 
     Samples pass outside of a second face of a corner there.
     """
@@ -132,7 +132,7 @@ def test_along_a_path(kind: str) -> None:
     assert ratios.mean() == pytest.approx(1.0, abs=0.1)
     assert ratios == pytest.approx(1.0, abs=0.2)
     leaps = np.abs(np.diff(ratios)) / np.minimum(ratios[1:], ratios[:-1])
-    assert leaps.max() < (0.1 if kind == "corner" else 0.15)
+    assert leaps.max() < (0.1 if kind == "corner" else 0.12)
 
 
 def cells(count: int, least: float, dent: float) -> tuple[list[np.ndarray], np.ndarray]:

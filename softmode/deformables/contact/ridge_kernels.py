@@ -2,17 +2,17 @@
 
 A half-space stands for a shape in a contact, with a dent of the scale that the functions of a body leave out. An edge
 presses a strip much narrower than that. On a half plane such a strip gives by the logarithm of its width: its force per
-length is E / (1 - nu^2) times its depth and a number that hardly grows with it, here as (depth / dent)^0.15. Of this
+length is E / (1 - nu^2) times its depth and a number that hardly grows with it, here as (depth / dent)^0.2. Of this
 spring and the one of the face that counts which presses more: faces meet samples that lie under them by chance, edges
 all around. With the inward normal m of the cell, c_i = n_i . m of the faces of the box and a_i the distances of the
 sample to them, the edge between faces i and j lies
 
-    delta = -(c_i a_i + c_j a_j)                     deep below the cell, and
+    delta(s) = -(c_i a_i + c_j a_j) + c_k s          deep below the cell, s along it beyond the sample, and
     xi = |c_j a_i - c_i a_j| / |(c_i, c_j)|          beside the sample.
 
-Of each edge a cell of area A has the length A / r (1 - xi / r), r the reach: over all cells the edge's own. It counts
-by the cube of the cosine of its slope below the cell, one for along its length, two for the force, as finite elements
-say of corners.
+Of each edge a cell of area A has the part from s = -r to r that is there and in, and of that the share A / (2 r^2)
+(1 - xi / r), r the reach: over all cells the edge's own. It lies as deep as its middle. It counts by the cube of the
+cosine of its slope below the cell, one for along its length, two for the force, as finite elements say of corners.
 """
 
 import warp as wp
@@ -31,7 +31,7 @@ WETTED = wp.constant(wp.float64(0.125))
 """Least share of r of an edge that goes in steeply that is counted."""
 RIDGE, NARROW = wp.constant(wp.float64(0.413)), wp.constant(wp.float64(0.2))
 """Force per length of an edge of 90 degrees over E / (1 - nu^2) and depth, as deep as the dent under that pressure; the
-power of the depth with which it grows: 0.26 where it is 1 % of the edge of the default cube, 0.34 at 5 %."""
+power of the depth with which it grows: 0.26 where it is 1 % of the edge of the default cube, 0.36 at 5 %."""
 
 STEEP = wp.constant(wp.float64(0.3))
 """Slope of the flatter of two faces over that of the steeper one, up to which their edge is the rim of a flat punch and
