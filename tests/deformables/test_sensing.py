@@ -150,7 +150,7 @@ def test_grasp():
 def test_torque_turns_the_body():
     """In a step dL = dt (c cross F + M), to what implicit Euler loses, omega dt of the angular momentum passed on.
 
-    Thrice that: while the body dents, its surface moves on faster than the body turns.
+    Three and a half times that: while the body dents, its surface moves on faster than the body turns.
     """
     scene, _ = impact(1.0, offset=(0.03, 0.02))
     sensor, worst, passed = SurfacePressure(scene.solver), 0.0, 0.0
@@ -163,7 +163,7 @@ def test_torque_turns_the_body():
         passed = max(passed, np.linalg.norm(impulse))
     omega = np.linalg.norm(scene.momentum()[1]) / (scene.mass() * EDGE**2 / 6.0)
     assert passed > 0.0
-    assert worst <= 3.0 * omega * scene.dt * np.linalg.norm(scene.momentum()[1])
+    assert worst <= 3.5 * omega * scene.dt * np.linalg.norm(scene.momentum()[1])
 
 
 def test_soft_on_soft():
@@ -261,11 +261,11 @@ def test_worlds_capture_and_reset():
                 for sensor in sensors:
                     sensor.update()
             scene.solver.reset(scene.state)
-            for _ in range(10):
+            for _ in range(8):
                 wp.capture_launch(capture.graph)
                 scene.state.assign(scene.next_state)
         else:
-            for _ in range(10):
+            for _ in range(8):
                 scene.step()
                 for sensor in sensors:
                     sensor.update()
