@@ -65,20 +65,21 @@ the backdrop stands before it."""
 def train_field(
     pictures: Sequence[PosedPicture],
     *,
-    wall: Sequence[float] = (1.0, 1.0, 1.0),
+    wall: Sequence[float] | None = (1.0, 1.0, 1.0),
     steps: int = 1000,
     seed: int = 0,
     metres: float | None = None,
     progress: Callable[[int, float], None] | None = None,
 ) -> RadianceGrid:
-    """Train a field on pictures of an object before a plain wall of a known colour.
+    """Train a field on pictures of an object before a plain wall.
 
     The exposure of each picture is found too. Colours do not depend on the direction. What no picture shows is filled.
     A cavity is empty as far as two pictures look into it.
 
     Args:
         pictures: The pictures; the border of each is the wall. The object is where their axes meet.
-        wall: Colour of the wall, sRGB 0..1. Where the object has it too, no picture says where its surface is.
+        wall: Colour of the wall, sRGB 0..1. None takes that of the border of most pictures, and the exposures are over
+            theirs. Where the object has it too, no picture says where its surface is.
         steps: Steps; 1,000 take two minutes on one core.
         seed: Seed of rays.
         metres: Metres of a unit of the poses, None if not known.
@@ -93,7 +94,7 @@ def train_field(
         ConfigError: If the number of steps is not positive, or the wall is no colour, or black.
     """
     require_number("steps", steps, at_least=1)
-    if len(wall) != 3 or not (min(wall) >= 0.0 and 0.0 < max(wall) <= 1.0):
+    if wall is not None and (len(wall) != 3 or not (min(wall) >= 0.0 and 0.0 < max(wall) <= 1.0)):
         raise ConfigError(f"wall is {wall}", hint="give the colour of the wall, three numbers 0..1, not black")
     if len({(p.camera.width, p.camera.height) for p in pictures}) != 1:
         raise AssetError("pictures of several sizes, or none", hint="give pictures of one size")
@@ -101,10 +102,14 @@ def train_field(
     images = np.stack([picture.pixels()[..., :3] for picture in pictures])
     border = np.concatenate([images[:, :3].reshape(len(images), -1, 3), images[:, -3:].reshape(len(images), -1, 3)], 1)
     back = np.median(border, axis=1).astype(np.float64)
+    color = np.median(back, axis=0)
+    wall = color.clip(1e-3) if wall is None else wall
     exposures = back.sum(axis=1) / sum(wall)
-    if np.median(np.abs(back - exposures[:, None] * wall).max(axis=1)) > 0.1:
-        color = np.median(back, axis=0).round(2).tolist()
-        raise AssetError(f"the border of the pictures is {color}, not the wall", hint="give its colour as wall")
+    if np.median(np.abs(border - (exposures[:, None] * wall)[:, None]).max(axis=2)) > 0.1:
+        raise AssetError(
+            f"the border of the pictures is {color.round(2).tolist()}, not the wall, or not of one colour",
+            hint="take pictures before a plain wall, and give its colour as wall",
+        )
     middle, half = _cube(pictures)
     carved = _hull(pictures, images, back, middle, half)
     if not carved.any():
@@ -170,7 +175,9 @@ def train_field(
     box = np.stack([middle - half, middle + half])
     field = RadianceGrid.from_bounds(density, c[..., None, :], box, name="trained field", metres=metres)
     full = _zoomed(s, COARSE / len(s)) < 0.0
-    share, allowed = contradicted(pictures, even, full, middle, half)[1], float(carved.sum() / full.sum())
+    share: Any = contradicted(pictures, even, full, middle, half)[1]
+    spare: Any = ndimage.binary_opening(carved & ~full)  # a hull is a node or two too large everywhere
+    allowed = 1.0 + float(spare.sum() / full.sum())
     return replace(field.cropped(*field.surroundings), contradicted=share, allowed=allowed)
 
 
@@ -264,7 +271,7 @@ class Walls:
         core = np.flatnonzero(near & (np.pad(np.ones((n - 2,) * 3), 1) > 0))
         around = self.rows[torch.tensor(core[:, None] + np.array([0, -n * n, n * n, -n, n, -1, 1]))]
         self.around = around[(around > 1).all(1)]
-        self.optimiser = torch.optim.Adam([self.s, self.c], betas=(0.9, 0.95), eps=1e-10)
+        self.optimiser = torch.optim.Adam([{"params": [x]} for x in (self.s, self.c)], betas=(0.9, 0.95), eps=1e-10)
 
     def dense(self) -> tuple[np.ndarray, np.ndarray]:
         """Return distances and colours at all nodes; far ones have the colour of the nearest."""
