@@ -103,9 +103,9 @@ def train_field(
     border = np.concatenate([images[:, :3].reshape(len(images), -1, 3), images[:, -3:].reshape(len(images), -1, 3)], 1)
     back = np.median(border, axis=1).astype(np.float64)
     color = np.median(back, axis=0)
-    wall = color.clip(1e-3) if wall is None else wall
-    exposures = back.sum(axis=1) / sum(wall)
-    if np.median(np.abs(border - (exposures[:, None] * wall)[:, None]).max(axis=2)) > 0.1:
+    known = color.clip(1e-3) if wall is None else np.array(wall, dtype=np.float64)
+    exposures = back.sum(axis=1) / known.sum()
+    if np.median(np.abs(border - (exposures[:, None] * known)[:, None]).max(axis=2)) > 0.1:
         raise AssetError(
             f"the border of the pictures is {color.round(2).tolist()}, not the wall, or not of one colour",
             hint="take pictures before a plain wall, and give its colour as wall",
@@ -126,7 +126,7 @@ def train_field(
     switch, fresh = int(SWITCH * steps), 0
     foggy = switch >= FIRST
     walls = Walls(_distance(carved), np.zeros((*carved.shape, 3)), fog=foggy)
-    plain = torch.tensor(wall, dtype=torch.float32)
+    plain = torch.tensor(known, dtype=torch.float32)
     gain = torch.tensor(np.log(exposures), dtype=torch.float32, requires_grad=True)
     gains = torch.optim.Adam([gain], lr=RATES[2])
     eyes = torch.tensor(np.array([p.camera.position for p in pictures]) - middle + half, dtype=torch.float32)
