@@ -6,7 +6,8 @@ Phi(s / beta) has there over here, at most all, where Phi is the logistic functi
 and its walls elsewhere.) On a coarse grid it begins as fog, of density Psi(-s / beta) / beta, where Psi is the
 distribution function of Laplace (VolSDF, Yariv et al. 2021): thin in the hull of the silhouettes, less what their
 colours contradict, it becomes dense where pictures ask for it. Then what light reaches is empty, and what none reaches
-is inside. (Fog in all of the hull puts a lid on every cavity.) Silhouettes take a backdrop that is known.
+is inside. (Fog in all of the hull puts a lid on every cavity.) A hull whose lid was carved away begins with a dense
+skin: else fog forms in front of a wall of one colour, and the floor of a cup stays thin. Silhouettes take a plain wall.
 """
 
 from __future__ import annotations
@@ -44,7 +45,11 @@ AT_ONCE = 1 << 16
 FOG, DENSE, LIT = 3.0, 0.7, 0.5
 """What nodes of the hull begin with [voxels]: a fortieth of the light is lost in a voxel; below which fog is solid, a
 quarter lost; a node is lit where so much of the light of two pictures comes to it."""
-RATES = (0.1, 0.03, 3.0e-3)
+CAVITY, SKIN, DEEP, FIRM, LEAN = 0.95, -1.0, 2.5, 0.3, 5.0e-8
+"""What is left of a hull with a cavity when its lid was carved away, at most. Then fog begins at a distance below 0 in
+a skin so many nodes deep and is solid below another one, and what is inside has a price on the fine grid, so that walls
+recede that pictures do not hold."""
+RATES = (0.1, 0.1, 3.0e-3)
 """Steps of distances [voxels], colours, and logarithms of exposures."""
 EIKONAL, SMOOTH, EVEN = 1.0e-2, 1.0e-3, 1.0e-3
 """Weights of (|grad s| - 1)^2, on the fine grid, of the curvature of s and of the differences of colours."""
@@ -118,14 +123,16 @@ def train_field(
     middle = middle - half + (low + high) * half / (COARSE - 1)
     half *= float((high - low).max()) / (COARSE - 1 - 2 * MARGIN)
     carved = _hull(pictures, images, back, middle, half)
+    skin, hull = _distance(carved) > -DEEP, carved.sum()
     even = images / exposures[:, None, None, None]
     while (wrong := contradicted(pictures, even, carved, middle, half))[1] > ENOUGH:
         carved &= ~wrong[0]
     if not carved.any():
         raise AssetError("the pictures contradict all of the hull", hint="check poses, lens and exposures")
     switch, fresh = int(SWITCH * steps), 0
-    foggy = switch >= FIRST
-    walls = Walls(_distance(carved), np.zeros((*carved.shape, 3)), fog=foggy)
+    foggy, cavity = switch >= FIRST, bool(carved.sum() < CAVITY * hull)
+    dense, lean = (FIRM, LEAN) if cavity else (DENSE, 0.0)
+    walls = Walls(_distance(carved), np.zeros((*carved.shape, 3)), fog=skin & cavity if foggy else None)
     plain = torch.tensor(known, dtype=torch.float32)
     gain = torch.tensor(np.log(exposures), dtype=torch.float32, requires_grad=True)
     gains = torch.optim.Adam([gain], lr=RATES[2])
@@ -148,7 +155,7 @@ def train_field(
     for step in range(steps):
         size = FINE if step >= switch else COARSE
         if size != walls.n or (step - fresh >= AGAIN and not foggy and step < 0.9 * steps):
-            walls, fresh, foggy = walls.anew(size, lit(walls) if foggy else None), step, False
+            walls, fresh, foggy = walls.anew(size, lit(walls) if foggy else None, dense), step, False
         part = (step - switch) / (steps - switch) if step >= switch else step / switch
         beta = WIDEST if foggy else WIDEST * (SHARPEST / WIDEST) ** min(part / 0.7, 1.0)
         for group, rate in zip(walls.optimiser.param_groups, RATES, strict=False):
@@ -161,8 +168,8 @@ def train_field(
         error = ((torch.minimum(seen, 1.0 + 0.01 * (seen - 1.0)) - target[ray]) ** 2).mean()  # cut at white
         for optimiser in (walls.optimiser, gains):
             optimiser.zero_grad()
-        more = walls.roughness(0.0) + EMPTY * walls.matter() if foggy else walls.roughness(EIKONAL)
-        (error + more).backward()
+        price = EMPTY if foggy else lean * max(1.0 - part / 0.7, 0.0)
+        (error + walls.roughness(0.0 if foggy else EIKONAL) + price * walls.matter()).backward()
         for optimiser in (walls.optimiser, gains):
             optimiser.step()
         if progress is not None:
@@ -255,16 +262,16 @@ def _reach(walls: Walls, eye: torch.Tensor, way: torch.Tensor, edge: float) -> t
 class Walls:
     """Signed distances [voxels] and colours at the nodes of a cube near a surface; the others are out (0) or in (1)."""
 
-    def __init__(self, distance: np.ndarray, shades: np.ndarray, *, fog: bool = False) -> None:
-        """Take dense arrays (n, n, n) and (n, n, n, 3), learned near the surface; or fill it with fog."""
-        n, near = len(distance), distance < 2.0 if fog else np.abs(distance) < BAND
+    def __init__(self, distance: np.ndarray, shades: np.ndarray, *, fog: np.ndarray | None = None) -> None:
+        """Take dense arrays (n, n, n) and (n, n, n, 3), learned near the surface; or begin as fog, dense in a skin."""
+        n, near = len(distance), np.abs(distance) < BAND if fog is None else distance < 2.0
         kept = np.flatnonzero(near)
         rows = np.where(distance.ravel() > 0.0, 0, 1)
         rows[kept] = np.arange(2, len(kept) + 2)
-        start = FOG + np.maximum(distance, 0.0) if fog else distance
+        start = distance if fog is None else np.where(fog, SKIN, FOG) + np.maximum(distance, 0.0)
         table = np.column_stack([start.ravel(), shades.reshape(-1, 3)])[kept]
         table = np.concatenate([[[30.0, 0.0, 0.0, 0.0], [-30.0, 0.0, 0.0, 0.0]], table])
-        self.n, self.near, self.rows, self.fog = n, near, torch.tensor(rows), fog
+        self.n, self.near, self.rows, self.fog = n, near, torch.tensor(rows), fog is not None
         self.s = torch.tensor(table[:, :1], dtype=torch.float32, requires_grad=True)
         self.c = torch.tensor(table[:, 1:], dtype=torch.float32, requires_grad=True)
         self.cells = torch.tensor(ndimage.maximum_filter(near, 2, origin=-1).ravel())
@@ -279,15 +286,15 @@ class Walls:
         nearest: Any = ndimage.distance_transform_edt(~self.near, return_distances=False, return_indices=True)
         return s[..., 0], c[tuple(nearest)]
 
-    def anew(self, n: int, lit: np.ndarray | None = None) -> Walls:
+    def anew(self, n: int, lit: np.ndarray | None = None, dense: float = DENSE) -> Walls:
         """Return them with true distances from the surface of the largest part, perhaps on a finer grid.
 
-        What was fog is full where it is dense, not `lit` (n^3,), or enclosed but for holes of some nodes.
+        What was fog is full below s = `dense`, where it is not `lit` (n^3,), or enclosed but for holes of some nodes.
         """
         s, c = self.dense()
         zoom = n / self.n
         if lit is not None:
-            s = s - DENSE
+            s = s - dense
             within: Any = ndimage.binary_erosion(self.near, iterations=2)
             solid: Any = (s < 0.0) | (within & ~lit.reshape(s.shape))
             whole: Any = ndimage.binary_fill_holes(ndimage.binary_closing(solid, iterations=2))
@@ -303,7 +310,9 @@ class Walls:
         return Walls(s, _zoomed(c, zoom) if zoom != 1.0 else c)
 
     def matter(self) -> torch.Tensor:
-        """Return the sum of the light that nodes of fog take within a voxel."""
+        """Return the sum of the light that nodes of fog take within a voxel, or how many nodes are inside."""
+        if not self.fog:
+            return torch.sigmoid(-self.s[2:] / WIDEST).sum()
         half = 0.5 * torch.exp(-self.s[2:].abs() / WIDEST)
         return (1.0 - torch.exp(-torch.where(self.s[2:] > 0.0, half, 1.0 - half) / WIDEST)).sum()
 

@@ -97,7 +97,7 @@ def test_what_light_reaches_is_empty() -> None:
     places = torch.stack(torch.meshgrid(line, line, indexing="ij"), dim=-1).reshape(-1, 2)
     for dense, inside in ((cup, False), ((shell < 11.0) & (shell > 8.0), True)):
         hull = (ring < 11.0) & (np.abs(z) < 9.0) if not inside else shell < 11.0
-        walls = Walls(np.where(hull, -1.0, 5.0), np.zeros((n, n, n, 3)), fog=True)
+        walls = Walls(np.where(hull, -1.0, 5.0), np.zeros((n, n, n, 3)), fog=hull)
         with torch.no_grad():
             walls.s[2:, 0] = torch.tensor(np.where(dense, -1.0, 3.0)[walls.near])
         lit = walls.lit(*torch.zeros(2, 0, 3), *torch.zeros(2, 0)).float()  # a picture that looks aside lights none
