@@ -6,7 +6,8 @@ Phi(s / beta) has there over here, at most all, where Phi is the logistic functi
 and its walls elsewhere.) On a coarse grid it begins as fog, of density Psi(-s / beta) / beta, where Psi is the
 distribution function of Laplace (VolSDF, Yariv et al. 2021): thin in the hull of the silhouettes, less what their
 colours contradict, it becomes dense where pictures ask for it. Then what light reaches is empty, and what none reaches
-is inside. (Fog in all of the hull puts a lid on every cavity.) Silhouettes take a backdrop that is known.
+is inside. (Fog in all of the hull puts a lid on every cavity.) A hull whose lid was carved away begins with a dense
+skin: else fog forms in front of a wall of one colour, and the floor of a cup stays thin. Silhouettes take a plain wall.
 """
 
 from __future__ import annotations
@@ -44,7 +45,11 @@ AT_ONCE = 1 << 16
 FOG, DENSE, LIT = 3.0, 0.7, 0.5
 """What nodes of the hull begin with [voxels]: a fortieth of the light is lost in a voxel; below which fog is solid, a
 quarter lost; a node is lit where so much of the light of two pictures comes to it."""
-RATES = (0.1, 0.03, 3.0e-3)
+CAVITY, SKIN, DEEP, FIRM, LEAN = 0.95, -1.0, 2.5, 0.3, 5.0e-8
+"""What is left of a hull with a cavity when its lid was carved away, at most. Then fog begins at a distance below 0 in
+a skin so many nodes deep and is solid below another one, and what is inside has a price on the fine grid, so that walls
+recede that pictures do not hold."""
+RATES = (0.1, 0.1, 3.0e-3)
 """Steps of distances [voxels], colours, and logarithms of exposures."""
 EIKONAL, SMOOTH, EVEN = 1.0e-2, 1.0e-3, 1.0e-3
 """Weights of (|grad s| - 1)^2, on the fine grid, of the curvature of s and of the differences of colours."""
@@ -65,20 +70,21 @@ the backdrop stands before it."""
 def train_field(
     pictures: Sequence[PosedPicture],
     *,
-    wall: Sequence[float] = (1.0, 1.0, 1.0),
+    wall: Sequence[float] | None = (1.0, 1.0, 1.0),
     steps: int = 1000,
     seed: int = 0,
     metres: float | None = None,
     progress: Callable[[int, float], None] | None = None,
 ) -> RadianceGrid:
-    """Train a field on pictures of an object before a plain wall of a known colour.
+    """Train a field on pictures of an object before a plain wall.
 
     The exposure of each picture is found too. Colours do not depend on the direction. What no picture shows is filled.
     A cavity is empty as far as two pictures look into it.
 
     Args:
         pictures: The pictures; the border of each is the wall. The object is where their axes meet.
-        wall: Colour of the wall, sRGB 0..1. Where the object has it too, no picture says where its surface is.
+        wall: Colour of the wall, sRGB 0..1. None takes that of the border of most pictures, and the exposures are over
+            theirs. Where the object has it too, no picture says where its surface is.
         steps: Steps; 1,000 take two minutes on one core.
         seed: Seed of rays.
         metres: Metres of a unit of the poses, None if not known.
@@ -93,7 +99,7 @@ def train_field(
         ConfigError: If the number of steps is not positive, or the wall is no colour, or black.
     """
     require_number("steps", steps, at_least=1)
-    if len(wall) != 3 or not (min(wall) >= 0.0 and 0.0 < max(wall) <= 1.0):
+    if wall is not None and (len(wall) != 3 or not (min(wall) >= 0.0 and 0.0 < max(wall) <= 1.0)):
         raise ConfigError(f"wall is {wall}", hint="give the colour of the wall, three numbers 0..1, not black")
     if len({(p.camera.width, p.camera.height) for p in pictures}) != 1:
         raise AssetError("pictures of several sizes, or none", hint="give pictures of one size")
@@ -101,10 +107,14 @@ def train_field(
     images = np.stack([picture.pixels()[..., :3] for picture in pictures])
     border = np.concatenate([images[:, :3].reshape(len(images), -1, 3), images[:, -3:].reshape(len(images), -1, 3)], 1)
     back = np.median(border, axis=1).astype(np.float64)
-    exposures = back.sum(axis=1) / sum(wall)
-    if np.median(np.abs(back - exposures[:, None] * wall).max(axis=1)) > 0.1:
-        color = np.median(back, axis=0).round(2).tolist()
-        raise AssetError(f"the border of the pictures is {color}, not the wall", hint="give its colour as wall")
+    color = np.median(back, axis=0)
+    known = color.clip(1e-3) if wall is None else np.array(wall, dtype=np.float64)
+    exposures = back.sum(axis=1) / known.sum()
+    if np.median(np.abs(border - (exposures[:, None] * known)[:, None]).max(axis=2)) > 0.1:
+        raise AssetError(
+            f"the border of the pictures is {color.round(2).tolist()}, not the wall, or not of one colour",
+            hint="take pictures before a plain wall, and give its colour as wall",
+        )
     middle, half = _cube(pictures)
     carved = _hull(pictures, images, back, middle, half)
     if not carved.any():
@@ -113,15 +123,17 @@ def train_field(
     middle = middle - half + (low + high) * half / (COARSE - 1)
     half *= float((high - low).max()) / (COARSE - 1 - 2 * MARGIN)
     carved = _hull(pictures, images, back, middle, half)
+    skin, hull = _distance(carved) > -DEEP, carved.sum()
     even = images / exposures[:, None, None, None]
     while (wrong := contradicted(pictures, even, carved, middle, half))[1] > ENOUGH:
         carved &= ~wrong[0]
     if not carved.any():
         raise AssetError("the pictures contradict all of the hull", hint="check poses, lens and exposures")
     switch, fresh = int(SWITCH * steps), 0
-    foggy = switch >= FIRST
-    walls = Walls(_distance(carved), np.zeros((*carved.shape, 3)), fog=foggy)
-    plain = torch.tensor(wall, dtype=torch.float32)
+    foggy, cavity = switch >= FIRST, bool(carved.sum() < CAVITY * hull)
+    dense, lean = (FIRM, LEAN) if cavity else (DENSE, 0.0)
+    walls = Walls(_distance(carved), np.zeros((*carved.shape, 3)), fog=skin & cavity if foggy else None)
+    plain = torch.tensor(known, dtype=torch.float32)
     gain = torch.tensor(np.log(exposures), dtype=torch.float32, requires_grad=True)
     gains = torch.optim.Adam([gain], lr=RATES[2])
     eyes = torch.tensor(np.array([p.camera.position for p in pictures]) - middle + half, dtype=torch.float32)
@@ -143,7 +155,7 @@ def train_field(
     for step in range(steps):
         size = FINE if step >= switch else COARSE
         if size != walls.n or (step - fresh >= AGAIN and not foggy and step < 0.9 * steps):
-            walls, fresh, foggy = walls.anew(size, lit(walls) if foggy else None), step, False
+            walls, fresh, foggy = walls.anew(size, lit(walls) if foggy else None, dense), step, False
         part = (step - switch) / (steps - switch) if step >= switch else step / switch
         beta = WIDEST if foggy else WIDEST * (SHARPEST / WIDEST) ** min(part / 0.7, 1.0)
         for group, rate in zip(walls.optimiser.param_groups, RATES, strict=False):
@@ -156,8 +168,8 @@ def train_field(
         error = ((torch.minimum(seen, 1.0 + 0.01 * (seen - 1.0)) - target[ray]) ** 2).mean()  # cut at white
         for optimiser in (walls.optimiser, gains):
             optimiser.zero_grad()
-        more = walls.roughness(0.0) + EMPTY * walls.matter() if foggy else walls.roughness(EIKONAL)
-        (error + more).backward()
+        price = EMPTY if foggy else lean * max(1.0 - part / 0.7, 0.0)
+        (error + walls.roughness(0.0 if foggy else EIKONAL) + price * walls.matter()).backward()
         for optimiser in (walls.optimiser, gains):
             optimiser.step()
         if progress is not None:
@@ -170,7 +182,9 @@ def train_field(
     box = np.stack([middle - half, middle + half])
     field = RadianceGrid.from_bounds(density, c[..., None, :], box, name="trained field", metres=metres)
     full = _zoomed(s, COARSE / len(s)) < 0.0
-    share, allowed = contradicted(pictures, even, full, middle, half)[1], float(carved.sum() / full.sum())
+    share: Any = contradicted(pictures, even, full, middle, half)[1]
+    spare: Any = ndimage.binary_opening(carved & ~full)  # a hull is a node or two too large everywhere
+    allowed = 1.0 + float(spare.sum() / full.sum())
     return replace(field.cropped(*field.surroundings), contradicted=share, allowed=allowed)
 
 
@@ -248,23 +262,23 @@ def _reach(walls: Walls, eye: torch.Tensor, way: torch.Tensor, edge: float) -> t
 class Walls:
     """Signed distances [voxels] and colours at the nodes of a cube near a surface; the others are out (0) or in (1)."""
 
-    def __init__(self, distance: np.ndarray, shades: np.ndarray, *, fog: bool = False) -> None:
-        """Take dense arrays (n, n, n) and (n, n, n, 3), learned near the surface; or fill it with fog."""
-        n, near = len(distance), distance < 2.0 if fog else np.abs(distance) < BAND
+    def __init__(self, distance: np.ndarray, shades: np.ndarray, *, fog: np.ndarray | None = None) -> None:
+        """Take dense arrays (n, n, n) and (n, n, n, 3), learned near the surface; or begin as fog, dense in a skin."""
+        n, near = len(distance), np.abs(distance) < BAND if fog is None else distance < 2.0
         kept = np.flatnonzero(near)
         rows = np.where(distance.ravel() > 0.0, 0, 1)
         rows[kept] = np.arange(2, len(kept) + 2)
-        start = FOG + np.maximum(distance, 0.0) if fog else distance
+        start = distance if fog is None else np.where(fog, SKIN, FOG) + np.maximum(distance, 0.0)
         table = np.column_stack([start.ravel(), shades.reshape(-1, 3)])[kept]
         table = np.concatenate([[[30.0, 0.0, 0.0, 0.0], [-30.0, 0.0, 0.0, 0.0]], table])
-        self.n, self.near, self.rows, self.fog = n, near, torch.tensor(rows), fog
+        self.n, self.near, self.rows, self.fog = n, near, torch.tensor(rows), fog is not None
         self.s = torch.tensor(table[:, :1], dtype=torch.float32, requires_grad=True)
         self.c = torch.tensor(table[:, 1:], dtype=torch.float32, requires_grad=True)
         self.cells = torch.tensor(ndimage.maximum_filter(near, 2, origin=-1).ravel())
         core = np.flatnonzero(near & (np.pad(np.ones((n - 2,) * 3), 1) > 0))
         around = self.rows[torch.tensor(core[:, None] + np.array([0, -n * n, n * n, -n, n, -1, 1]))]
         self.around = around[(around > 1).all(1)]
-        self.optimiser = torch.optim.Adam([self.s, self.c], betas=(0.9, 0.95), eps=1e-10)
+        self.optimiser = torch.optim.Adam([{"params": [x]} for x in (self.s, self.c)], betas=(0.9, 0.95), eps=1e-10)
 
     def dense(self) -> tuple[np.ndarray, np.ndarray]:
         """Return distances and colours at all nodes; far ones have the colour of the nearest."""
@@ -272,15 +286,15 @@ class Walls:
         nearest: Any = ndimage.distance_transform_edt(~self.near, return_distances=False, return_indices=True)
         return s[..., 0], c[tuple(nearest)]
 
-    def anew(self, n: int, lit: np.ndarray | None = None) -> Walls:
+    def anew(self, n: int, lit: np.ndarray | None = None, dense: float = DENSE) -> Walls:
         """Return them with true distances from the surface of the largest part, perhaps on a finer grid.
 
-        What was fog is full where it is dense, not `lit` (n^3,), or enclosed but for holes of some nodes.
+        What was fog is full below s = `dense`, where it is not `lit` (n^3,), or enclosed but for holes of some nodes.
         """
         s, c = self.dense()
         zoom = n / self.n
         if lit is not None:
-            s = s - DENSE
+            s = s - dense
             within: Any = ndimage.binary_erosion(self.near, iterations=2)
             solid: Any = (s < 0.0) | (within & ~lit.reshape(s.shape))
             whole: Any = ndimage.binary_fill_holes(ndimage.binary_closing(solid, iterations=2))
@@ -296,7 +310,9 @@ class Walls:
         return Walls(s, _zoomed(c, zoom) if zoom != 1.0 else c)
 
     def matter(self) -> torch.Tensor:
-        """Return the sum of the light that nodes of fog take within a voxel."""
+        """Return the sum of the light that nodes of fog take within a voxel, or how many nodes are inside."""
+        if not self.fog:
+            return torch.sigmoid(-self.s[2:] / WIDEST).sum()
         half = 0.5 * torch.exp(-self.s[2:].abs() / WIDEST)
         return (1.0 - torch.exp(-torch.where(self.s[2:] > 0.0, half, 1.0 - half) / WIDEST)).sum()
 

@@ -54,7 +54,8 @@ class RadianceGrid:
     contradicted: float | None = None
     """Share of its surface in the largest patch that the pictures it was trained on contradict. None if not known."""
     allowed: float | None = None
-    """Volume of the largest solid that those pictures do not contradict, over that of its own. None if not known."""
+    """Volume of its solid and of what thick parts those pictures allow beside it, over that of its solid. None if not
+    known."""
 
     def __post_init__(self) -> None:
         """Convert, validate and freeze the arrays."""

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from softmode.deformables import quadrature_from_density
+from softmode.deformables.quadrature.quadrature_density import is_doubtful
 from softmode.errors import AssetError, ConfigError
 from softmode.radiance import RadianceGrid, render_radiance
 from softmode.splats import Lens, PinholeCamera, read_transforms, write_transforms
@@ -40,21 +41,25 @@ def pictures(folder: Path, count: int) -> Path:
 
 
 def test_a_ball_is_a_ball(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ten small pictures and coarse grids leave a solid of walls with the ball's volume to a sixth, and its colours."""
+    """Ten small pictures and coarse grids leave a solid of walls with the ball's volume to a sixth, and its colours.
+
+    The wall's colour is not told. The solid is not doubted, for its hull is larger by a skin alone.
+    """
     from softmode.learning import train_field
 
     for name, value in {"COARSE": 24, "FINE": 32, "RAYS": 1024, "REGULAR": 1000}.items():
         monkeypatch.setattr(f"softmode.learning.field_training.{name}", value)
     told: list[float] = []
-    found = train_field(
-        read_transforms(pictures(tmp_path, 10)), steps=120, metres=1.0, progress=lambda _, error: told.append(error)
-    )
+    shown = read_transforms(pictures(tmp_path, 10))
+    found = train_field(shown, wall=None, steps=120, metres=1.0, progress=lambda _, error: told.append(error))
     assert np.mean(told[-5:]) < 0.2 * np.mean(told[:5])
     box = found.bounds + np.array([[-1.0], [1.0]]) * found.spacing
     solid = quadrature_from_density(found.densities, box, surface_count=16, point_count=500)
     seen = RADIUS + 0.001  # density rises over 3 mm, and rays along the rim lose half of their light that far out
     assert solid.volume == pytest.approx(4.0 / 3.0 * np.pi * seen**3, rel=1.0 / 6.0)
     assert solid.report["fog"] < 0.8 and found.metres == 1.0
+    assert found.allowed is not None and found.contradicted is not None
+    assert found.allowed < 1.1 and not is_doubtful(found.contradicted, found.allowed)
     top, bottom = found.colors([[0.0, 0.0, RADIUS], [0.0, 0.0, -RADIUS]], [[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
     assert top[0] > top[2] and bottom[2] > bottom[0]
 
@@ -92,7 +97,7 @@ def test_what_light_reaches_is_empty() -> None:
     places = torch.stack(torch.meshgrid(line, line, indexing="ij"), dim=-1).reshape(-1, 2)
     for dense, inside in ((cup, False), ((shell < 11.0) & (shell > 8.0), True)):
         hull = (ring < 11.0) & (np.abs(z) < 9.0) if not inside else shell < 11.0
-        walls = Walls(np.where(hull, -1.0, 5.0), np.zeros((n, n, n, 3)), fog=True)
+        walls = Walls(np.where(hull, -1.0, 5.0), np.zeros((n, n, n, 3)), fog=hull)
         with torch.no_grad():
             walls.s[2:, 0] = torch.tensor(np.where(dense, -1.0, 3.0)[walls.near])
         lit = walls.lit(*torch.zeros(2, 0, 3), *torch.zeros(2, 0)).float()  # a picture that looks aside lights none
@@ -106,7 +111,7 @@ def test_what_light_reaches_is_empty() -> None:
 
 
 def test_silhouettes_without_anything_in_common(tmp_path: Path) -> None:
-    """Pictures of a wall alone, of another than is stated, or of several sizes are refused."""
+    """Pictures of a wall alone, of another than is stated, of no plain one, or of several sizes are refused."""
     from softmode.learning import train_field
 
     cameras = [PinholeCamera.look_at(f"{i}", position=(0.3, 0.1 * i, 0.1), target=(0.0, 0.0, 0.0), width=16, height=16)
@@ -118,5 +123,8 @@ def test_silhouettes_without_anything_in_common(tmp_path: Path) -> None:
         train_field(())
     with pytest.raises(AssetError, match="not the wall"):
         train_field(read_transforms(tmp_path), wall=(0.1, 0.9, 0.1))
+    write_transforms(tmp_path, cameras, np.random.default_rng(0).uniform(size=(3, 16, 16, 3)))
+    with pytest.raises(AssetError, match="not of one colour"):
+        train_field(read_transforms(tmp_path), wall=None)
     with pytest.raises(ConfigError, match="wall is"):
         train_field(read_transforms(tmp_path), wall=(0.0, 0.0, 0.0))

@@ -35,10 +35,10 @@ LEVELS = (0.5, 0.4, 0.3, 0.2, 0.1, 0.05)
 walls."""
 FOGGY = 1.0
 """Voxels by which half the level moves the surface out from which on a density is fog, however thin its walls."""
-DOUBTED, ALLOWED = 0.01, 1.35
-"""Share of a surface in a patch that pictures contradict, and volume that they allow over its own, from which on a
-trained solid is doubtful. Patches are at most 0.008 where it is right, and 0.06 where a cup is full; toys without deep
-cavities are allowed 1.2 to 1.6 times their volume, a mug 3.1 times."""
+DOUBTED, ALLOWED = 0.03, 1.35
+"""Share of a surface in a patch that pictures contradict, and volume with the thick parts that they allow beside it
+over its own, from which on a trained solid is doubtful. Patches are at most 0.018 on true surfaces and 0.06 to 0.10
+where a cup is full. A true bear, doughnut or glove is allowed 1.03 to 1.16 times its volume, a mug 2.7 times."""
 LID = 0.8
 """Share of the full occupancy that walls around a void have, two voxels thick; what closes it with less may be none."""
 DEPTH, REACH, STEP = 0.5, 3.0, 0.25
