@@ -358,7 +358,7 @@ def gradient(kind: str, name: str) -> Figure:
     elif kind == "box":
         omega = (0.0, 0.0, 0.0)
     elif kind == "edge":
-        turn, height, omega = rotation((0, 1, 0), 0.23 * np.pi), 0.0714, (0.0, 1.0, 0.0)
+        turn, height, omega = rotation((0, 1, 0), 0.23 * np.pi), 0.0716, (0.0, 1.0, 0.0)
     soft.q.assign(I[:, :3] @ (turn.T - np.eye(3)) + I[:, 3:] * np.array([0.0, 0.0, height]))
     soft.qd.assign(I[:, :3] @ turn.T @ np.cross(omega, np.eye(3)) + I[:, 3:] * np.array(v))
     case.least = 0
