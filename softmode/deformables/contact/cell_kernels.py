@@ -81,7 +81,7 @@ class CellShape:
     moments: wp.mat33d  # M [m^2]
     bend: wp.float64  # b [m]
     least: wp.float64  # e_0 [m]
-    steepest: wp.float64  # range by tilt beyond which a cell counts as level again: most of the margin [m]
+    steepest: wp.float64  # range by tilt beyond which a cell counts as level again: the margin, less where thin [m]
     fade: wp.float64  # that of a level and flat cell [m]
     poissons_ratio: wp.float64
 

@@ -110,7 +110,7 @@ def cells(body: ReducedBody) -> tuple[Array, Array]:
     A cell is what is nearer to its sample than to any other in the plane there, up to where that meets the faces of
     those that face another way. It is as large as the area of its sample.
     """
-    x, n, area = body.surface.points, body.surface.normals, body.surface.areas
+    x, n, area = body.surface.points, body.surface.normals, np.maximum(body.surface.areas, 1e-30)
     near = KDTree(x).query(x, min(CELL_NEIGHBOURS + 1, len(x)))[1].reshape(len(x), -1)[:, 1:]
     arm, other = x[near] - x[:, None], n[near]
     same = np.einsum("ik,ijk->ij", n, other) > 0.5

@@ -468,7 +468,9 @@ def find_contacts(
         if end == 0.0 and query.distance > 0.0 and travel > instances.margin[i] and travel > query.distance:
             # a half-space at the start would also stop fast samples that fly past a small shape
             along = wp.quat_rotate_inv(turn, drift) / travel
-            end = travel
+            if part == 1.0 or wp.dot(query.normal, along) > -OPPOSED:  # else its cell comes down on a face
+                end = travel
+                part = 1.0
         if end > 0.0:
             query = march(shapes, shape, local, query, along, end, back, thick, instances.smoothing[i], far)
         if kind == BOX and query.distance >= reach and query.distance < FAR * side:
