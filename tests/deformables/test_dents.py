@@ -16,6 +16,7 @@ from softmode.deformables.contact.dents import (
     cells,
     dent_lengths,
     dent_weights,
+    insets,
     resolved_size,
 )
 from softmode.deformables.materials.material import Material
@@ -310,3 +311,13 @@ def test_cells_of_no_area() -> None:
     )
     assert np.isfinite(middle).all() and np.isfinite(moments).all()
     assert np.abs(moments[0]).max() < 1.0e-24
+
+
+def test_squares_end_at_edges() -> None:
+    """The squares that stand for cells of a cube lie within its faces, and away from its edges about their samples."""
+    surface, shift = cube().surface, insets(cube())
+    assert np.abs((shift * surface.normals).sum(axis=1)).max() < 1.0e-12
+    reach = np.abs(surface.points + shift) + 0.5 * np.sqrt(surface.areas)[:, None]
+    assert reach[np.abs(surface.normals) < 0.5].max() < 0.05 + 1.0e-9
+    inside = np.abs(surface.points) + 0.5 * np.sqrt(surface.areas)[:, None] < 0.05
+    assert not shift[(inside | (np.abs(surface.normals) > 0.5)).all(axis=1)].any()

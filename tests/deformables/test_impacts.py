@@ -162,7 +162,9 @@ def test_a_rim_stops_what_comes_down_on_it() -> None:
     def populate(world):
         material = Material(youngs_modulus=1.0e5, density=300.0, friction=0.0)
         add_reduced_body(world, cube(), material=material, position=(0.0, 0.0, 0.0533), velocity=(0.0, 0.0, -2.0))
-        world.add_shape_box(-1, xform=wp.transform(wp.vec3(0.097, 0.0, -0.05), wp.quat()), hx=0.1, hy=0.1, hz=0.05)
+        world.add_shape_box(
+            -1, xform=wp.transform(wp.vec3(0.097, 0.0, -0.05), wp.quat_identity()), hx=0.1, hy=0.1, hz=0.05
+        )
 
     scene = Scene(populate, [cube()], dt=1.0 / 240.0)
     scene.step(2)

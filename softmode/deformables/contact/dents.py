@@ -131,6 +131,27 @@ def cells(body: ReducedBody) -> tuple[Array, Array]:
     return middle, 12.0 * (moments - middle[:, :, None] * middle[:, None])
 
 
+def insets(body: ReducedBody) -> Array:
+    """Return how far the square that stands for a cell lies from its sample, as it ends at the body's edges [m]."""
+    x, n, side = body.surface.points, body.surface.normals, np.sqrt(body.surface.areas)
+    near = KDTree(x).query(x, min(CELL_NEIGHBOURS + 1, len(x)))[1].reshape(len(x), -1)
+    height = np.einsum("ik,ijk->ij", n, n[near])
+    toward = n[near] - height[..., None] * n[:, None]
+    steep = np.maximum(np.linalg.norm(toward, axis=2), 1e-30)
+    toward /= steep[..., None]
+    edge = np.einsum("ijk,ijk->ij", x[near] - x[:, None], n[near]) / steep
+    edge = np.where((height < 0.5) & (steep > 0.5) & (edge >= 0.0), edge, 1e30)
+    shift = np.zeros_like(x)
+    for _ in range(2):  # the nearest edge, and the nearest across
+        nearest = edge.argmin(axis=1)
+        first, way = edge.min(axis=1), toward[np.arange(len(x)), nearest]
+        along = np.einsum("ijk,ik->ij", toward, way)
+        behind = np.where(along < -0.5, edge, 1e30).min(axis=1)
+        shift -= np.maximum(np.minimum(0.5 * side - first, 0.5 * (behind - first)), 0.0)[:, None] * way
+        edge = np.where(np.abs(along) > 0.5, 1e30, edge)
+    return shift
+
+
 def surface_table(
     bodies: Sequence[ReducedBody], stiffness: Array, first_row: int, row_max: int, device: wp.Device
 ) -> Surface:
@@ -152,6 +173,7 @@ def surface_table(
         "curvature": np.concatenate([mean_curvature(body) for body in bodies]),
         "middle": np.concatenate([middle for middle, _moments in cell]),
         "moments": np.concatenate([moments for _middle, moments in cell]),
+        "inset": np.concatenate([insets(body) for body in bodies]),
         "start": np.cumsum([0, *(len(samples) for samples, _weights in around)]),
         "neighbour": np.concatenate([samples for samples, _weights in around]),
         "weight": np.concatenate([weights for _samples, weights in around]),
