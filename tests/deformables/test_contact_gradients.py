@@ -288,6 +288,7 @@ def test_cells_at_a_rim() -> None:
         "q": 1e-4,
         "qd": 1e-3,
         "youngs_modulus": 1e-3,
+        "density": 1e-3,
         "poissons_ratio": 1e-3,
         "friction": 1e-3,
     }.items():
