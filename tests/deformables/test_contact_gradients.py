@@ -276,15 +276,22 @@ def test_edges(kind: str) -> None:
 def test_cells_at_a_rim() -> None:
     """On a box smaller than the face above it, cells are cut at its rim: parts and their middles follow the state.
 
-    Within 1e-2 of differences; with what neighbours count of these parts left out, dL/dnu is 0.78 of that, and 2 % of
-    dL/dmu are missing. Differences by E and rho leap by 0.1, as a cell comes or goes.
+    Within 1e-2 of differences; with what neighbours count of these parts left out, dL/dv_0 is 1.10 of that and dL/dnu
+    0.93. Differences over smaller steps leap by 0.1, as gaps are float32.
     """
-    case = Landing(1.0e5, friction=0.8, turntable=(0.032, 0.036))
+    case = Landing(1.0e5, friction=0.8, turntable=(0.0335, 0.0405))
     case.turntable = None
     gradients = case.gradients()
     part = case.scene.reduced.view.samples.part.numpy()
     assert ((part > 0.0) & (part < 1.0)).sum() > 3
-    for name, relative in {"q": 1e-4, "qd": 1e-4, "poissons_ratio": 1e-4, "friction": 1e-3}.items():
+    for name, relative in {
+        "q": 1e-4,
+        "qd": 1e-3,
+        "youngs_modulus": 1e-3,
+        "density": 1e-3,
+        "poissons_ratio": 1e-3,
+        "friction": 1e-3,
+    }.items():
         assert case.gradient(gradients, name) == pytest.approx(case.difference(name, relative), rel=1.0e-2), name
 
 

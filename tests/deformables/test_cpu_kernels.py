@@ -282,7 +282,7 @@ def test_culled_shapes_touch_nothing(fresh: bool) -> None:
     found = []
     for mask in (culled, np.full_like(culled, -1)):
         t.samples.near.assign(mask)
-        known = (t.instances, t.basis, t.motion, t.candidate, t.near, t.shapes, float(dt))
+        known = (t.instances, t.basis, t.motion, t.candidate, t.near, t.shapes, t.surface.inset, float(dt))
         t.launch(detection_kernels.find_contacts, t.samples.position.shape, *known, *before, t.samples)
         found.append([array.numpy().copy() for array in (t.samples.shape, t.samples.gap, t.samples.normal)])
     touched = found[0][0] >= 0

@@ -3,12 +3,22 @@
 Builds a cube with samples as fine as contact patches need.
 """
 
+import dataclasses
+
 import newton
 import numpy as np
 import pytest
 
 from softmode.deformables.body.reduced_body import ReducedBody
-from softmode.deformables.contact.dents import DENT_FACTOR, WALL_SHARE, dent_lengths, dent_weights, resolved_size
+from softmode.deformables.contact.dents import (
+    DENT_FACTOR,
+    WALL_SHARE,
+    cells,
+    dent_lengths,
+    dent_weights,
+    insets,
+    resolved_size,
+)
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body
 from softmode.deformables.quadrature.quadrature import quadrature_from_box
@@ -289,3 +299,25 @@ def test_soft_bodies_share_their_dents() -> None:
     soft, stiff = (np.abs(dent[k, middle[k], 2]) for k in range(2))
     assert soft.max() == pytest.approx(4.0 * stiff.max(), rel=0.3)
     assert (dent[0, middle[0], 2] <= 0.0).all() and (dent[1, middle[1], 2] >= 0.0).all()
+
+
+def test_cells_of_no_area() -> None:
+    """A sample without area, which another lies on, has a finite cell: of nothing."""
+    surface = cube().surface
+    points, areas = surface.points.copy(), surface.areas.copy()
+    points[1], areas[0] = points[0], 0.0
+    middle, moments = cells(
+        dataclasses.replace(cube(), surface=dataclasses.replace(surface, points=points, areas=areas))
+    )
+    assert np.isfinite(middle).all() and np.isfinite(moments).all()
+    assert np.abs(moments[0]).max() < 1.0e-24
+
+
+def test_squares_end_at_edges() -> None:
+    """The squares that stand for cells of a cube lie within its faces, and away from its edges about their samples."""
+    surface, shift = cube().surface, insets(cube())
+    assert np.abs((shift * surface.normals).sum(axis=1)).max() < 1.0e-12
+    reach = np.abs(surface.points + shift) + 0.5 * np.sqrt(surface.areas)[:, None]
+    assert reach[np.abs(surface.normals) < 0.5].max() < 0.05 + 1.0e-9
+    inside = np.abs(surface.points) + 0.5 * np.sqrt(surface.areas)[:, None] < 0.05
+    assert not shift[(inside | (np.abs(surface.normals) > 0.5)).all(axis=1)].any()

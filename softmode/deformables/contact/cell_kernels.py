@@ -56,6 +56,7 @@ class Surface:
     curvature: wp.array[float]  # mean curvature of the asset at rest [1/m]
     middle: wp.array[wp.vec3]  # of its cell, from the sample [m]
     moments: wp.array[wp.mat33]  # twelve times the second moments of its cell about that [m^2]
+    inset: wp.array[wp.vec3]  # middle of the square that stands for it at a rim, likewise [m]
     start: wp.array[int]  # (sample_total + 1,), where each sample's neighbourhood begins in
     neighbour: wp.array[int]  # samples, counted within their body, and
     weight: wp.array[float]  # their weights, of sum ``CARRIED``
@@ -81,7 +82,7 @@ class CellShape:
     moments: wp.mat33d  # M [m^2]
     bend: wp.float64  # b [m]
     least: wp.float64  # e_0 [m]
-    steepest: wp.float64  # range by tilt beyond which a cell counts as level again: most of the margin [m]
+    steepest: wp.float64  # range by tilt beyond which a cell counts as level again: the margin, less where thin [m]
     fade: wp.float64  # that of a level and flat cell [m]
     poissons_ratio: wp.float64
 

@@ -110,7 +110,7 @@ def cells(body: ReducedBody) -> tuple[Array, Array]:
     A cell is what is nearer to its sample than to any other in the plane there, up to where that meets the faces of
     those that face another way. It is as large as the area of its sample.
     """
-    x, n, area = body.surface.points, body.surface.normals, body.surface.areas
+    x, n, area = body.surface.points, body.surface.normals, np.maximum(body.surface.areas, 1e-30)
     near = KDTree(x).query(x, min(CELL_NEIGHBOURS + 1, len(x)))[1].reshape(len(x), -1)[:, 1:]
     arm, other = x[near] - x[:, None], n[near]
     same = np.einsum("ik,ijk->ij", n, other) > 0.5
@@ -129,6 +129,27 @@ def cells(body: ReducedBody) -> tuple[Array, Array]:
     middle = np.einsum("ir,irk->ik", share * reach**3 / 3.0, ray)
     moments = np.einsum("ir,irk,irl->ikl", share * reach**4 / 4.0, ray, ray)
     return middle, 12.0 * (moments - middle[:, :, None] * middle[:, None])
+
+
+def insets(body: ReducedBody) -> Array:
+    """Return how far the square that stands for a cell lies from its sample, as it ends at the body's edges [m]."""
+    x, n, side = body.surface.points, body.surface.normals, np.sqrt(body.surface.areas)
+    near = KDTree(x).query(x, min(CELL_NEIGHBOURS + 1, len(x)))[1].reshape(len(x), -1)
+    height = np.einsum("ik,ijk->ij", n, n[near])
+    toward = n[near] - height[..., None] * n[:, None]
+    steep = np.maximum(np.linalg.norm(toward, axis=2), 1e-30)
+    toward /= steep[..., None]
+    edge = np.einsum("ijk,ijk->ij", x[near] - x[:, None], n[near]) / steep
+    edge = np.where((height < 0.5) & (steep > 0.5) & (edge >= 0.0), edge, 1e30)
+    shift = np.zeros_like(x)
+    for _ in range(2):  # the nearest edge, and the nearest across
+        nearest = edge.argmin(axis=1)
+        first, way = edge.min(axis=1), toward[np.arange(len(x)), nearest]
+        along = np.einsum("ijk,ik->ij", toward, way)
+        behind = np.where(along < -0.5, edge, 1e30).min(axis=1)
+        shift -= np.maximum(np.minimum(0.5 * side - first, 0.5 * (behind - first)), 0.0)[:, None] * way
+        edge = np.where(np.abs(along) > 0.5, 1e30, edge)
+    return shift
 
 
 def surface_table(
@@ -152,6 +173,7 @@ def surface_table(
         "curvature": np.concatenate([mean_curvature(body) for body in bodies]),
         "middle": np.concatenate([middle for middle, _moments in cell]),
         "moments": np.concatenate([moments for _middle, moments in cell]),
+        "inset": np.concatenate([insets(body) for body in bodies]),
         "start": np.cumsum([0, *(len(samples) for samples, _weights in around)]),
         "neighbour": np.concatenate([samples for samples, _weights in around]),
         "weight": np.concatenate([weights for _samples, weights in around]),

@@ -360,6 +360,7 @@ def face_part(
     motion: Motion,
     shapes: Shapes,
     samples: Samples,
+    inset: wp.array[wp.vec3],  # as of ``Surface``
     i: int,
     row: int,
     shape: int,
@@ -375,6 +376,7 @@ def face_part(
     middle = wp.vec3d()
     if near_rim(box):
         box.F = wp.transpose(frame) * gradient_of(instances, basis, motion.q_start, i, row)
+        box.inset = wp.vec3d(inset[row])
         axis, part, middle = part_under_face(box)
     return box, frame, axis, part, middle
 
@@ -387,6 +389,7 @@ def find_contacts(
     candidate: wp.array2d[int],
     near: wp.array2d[int],
     shapes: Shapes,
+    inset: wp.array[wp.vec3],  # as of ``Surface``
     dt: float,
     # State in:
     stick_shape: wp.array[wp.vec2i],  # (particle_count,), see ``remember_slip``
@@ -438,7 +441,9 @@ def find_contacts(
         depth = instances.scale[i] * float(wp.length(basis.inner_point[row]))
         part = float(1.0)
         if kind == BOX and query.distance < wp.max(reach, FAR * side):
-            box, _frame, axis, under, _middle = face_part(instances, basis, motion, shapes, samples, i, row, shape)
+            box, _frame, axis, under, _middle = face_part(
+                instances, basis, motion, shapes, samples, inset, i, row, shape
+            )
             level = float(1.0e30)
             if axis >= 0:
                 level = float(wp.abs(box.x[axis]) - box.half[axis])
@@ -468,7 +473,9 @@ def find_contacts(
         if end == 0.0 and query.distance > 0.0 and travel > instances.margin[i] and travel > query.distance:
             # a half-space at the start would also stop fast samples that fly past a small shape
             along = wp.quat_rotate_inv(turn, drift) / travel
-            end = travel
+            if part == 1.0 or wp.dot(query.normal, along) > -OPPOSED:  # else its cell comes down on a face
+                end = travel
+                part = 1.0
         if end > 0.0:
             query = march(shapes, shape, local, query, along, end, back, thick, instances.smoothing[i], far)
         if kind == BOX and query.distance >= reach and query.distance < FAR * side:
@@ -710,7 +717,9 @@ def gather_contacts(
             fade = fade_of(cell_shape, ahead, normal)
             touched = touched_share(surface, samples.shape, samples.gap, samples.part, cell_shape, fade, i, row, shape)
         if part < wp.float64(1.0):
-            _box, _frame, _axis, _part, middle = face_part(instances, basis, motion, shapes, samples, i, row, shape)
+            _box, _frame, _axis, _part, middle = face_part(
+                instances, basis, motion, shapes, samples, surface.inset, i, row, shape
+            )
             gap += wp.dot(normal, start * middle)
             closing += wp.dot(normal, (ahead - start) * middle)
         cell_shape = part_of_cell(cell_shape, part)

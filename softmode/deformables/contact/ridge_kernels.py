@@ -48,6 +48,7 @@ class Box:
     half: wp.vec3d  # extents [m]
     x: wp.vec3d  # the sample
     F: wp.mat33d  # its deformation gradient
+    inset: wp.vec3d  # middle of the square that stands for it at a rim, from the sample at rest [m]
     normal: wp.vec3d  # outward normal of the cell at rest, which F turns and the frame does not
     front: wp.vec3d  # normal of what is nearest
     area: wp.float64  # of the cell [m^2]

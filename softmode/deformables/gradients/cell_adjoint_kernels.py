@@ -97,6 +97,7 @@ def part_of(
     motion: Motion,
     shapes: Shapes,
     samples: Samples,
+    surface: Surface,
     i: int,
     sample: int,
     shape: int,
@@ -106,7 +107,9 @@ def part_of(
     part = wp.float64(samples.part[i, s, slot_of(samples, i, s, shape)])
     middle = wp.vec3d()
     if part < wp.float64(1.0):
-        _box, _frame, _axis, _part, middle = face_part(instances, basis, motion, shapes, samples, i, sample, shape)
+        _box, _frame, _axis, _part, middle = face_part(
+            instances, basis, motion, shapes, samples, surface.inset, i, sample, shape
+        )
     return part, middle
 
 
@@ -223,7 +226,7 @@ def accumulate_cells(
     gap = gap_of(instances, samples, i, row, shape)
     other = curvature_of(shapes, shape, face)
     cell_shape = shape_of_cell(surface, instances, basis, i, row, other)
-    part, middle = part_of(instances, basis, motion, shapes, samples, i, row, shape)
+    part, middle = part_of(instances, basis, motion, shapes, samples, surface, i, row, shape)
     cut = part_of_cell(cell_shape, part)
     open_gap = gap + wp.dot(face, start * middle)
     closing += wp.dot(face, (ahead - start) * middle)
@@ -362,7 +365,9 @@ def accumulate_parts(
                     y = (step.cell_fade[i, other][0] - samples.gap[i, s, slot]) / step.cell_fade[i, other][1]
                     counted = wp.float64(surface.weight[m] * samples.part[i, s, slot]) * touching(y)
                     part_bar -= step.cell_spared[i, other] * counted
-    rim, turn, _axis, _part, _middle = face_part(instances, basis, motion, shapes, samples, i, row, shape)
+    rim, turn, _axis, _part, _middle = face_part(
+        instances, basis, motion, shapes, samples, surface.inset, i, row, shape
+    )
     by_rim, _by_part, _by_middle = wp.grad(part_loss)(rim, part_bar, step.middle_bar[i, e])
     step.edge_gradient[i, e] = step.edge_gradient[i, e] + turn * by_rim.F
     step.edge_place[i, e] = step.edge_place[i, e] + turn * by_rim.x
@@ -392,7 +397,7 @@ def restore_rows(
     n = normal_of(instances, samples, i, row, shape)
     start, ahead, closing = motion_of_cell(instances, basis, motion, shapes, samples, i, row, shape, n, dt)
     cell_shape = shape_of_cell(surface, instances, basis, i, row, curvature_of(shapes, shape, n))
-    part, middle = part_of(instances, basis, motion, shapes, samples, i, row, shape)
+    part, middle = part_of(instances, basis, motion, shapes, samples, surface, i, row, shape)
     gap = gap_of(instances, samples, i, row, shape) + wp.dot(n, start * middle)
     closing += wp.dot(n, (ahead - start) * middle)
     ratio = constraints.stiffness[i, e] * constraints.dent_compliance[i, e]

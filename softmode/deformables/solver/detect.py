@@ -77,7 +77,7 @@ def _find_contacts(t: StepTables, state: newton.State, dt: float, prescribed: bo
     if not t.model.device.is_cuda:
         shapes = (candidate, t.near, t.shapes, float(dt))
         t.launch(eights.cull_samples, t.layout.instance_count, t.instances, t.basis, *shapes, *before, t.samples)
-    known = (t.instances, t.basis, t.motion, candidate, t.near, t.shapes, float(dt))
+    known = (t.instances, t.basis, t.motion, candidate, t.near, t.shapes, t.surface.inset, float(dt))
     t.launch(kernels.find_contacts, t.samples.position.shape, *known, *before, t.samples)
     stick = (int(prescribed), wp.float64(t.options.stick_ratio), t.team, float(dt))
     t.launch_teams(
