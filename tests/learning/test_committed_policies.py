@@ -15,7 +15,7 @@ LEAST = {
     "lift_soft": (18, 20),
     "lift_soft_gentle": (18, 20),
     "lift_soft_robust": (18, 20),
-    "lift_beam": (18, 20),
+    "lift_beam": (16, 20),
     "press_soft": (17, 20),
     "push_soft": (15, 20),
     "push_soft_robust": (18, 20),
