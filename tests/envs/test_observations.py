@@ -75,23 +75,25 @@ class HostState:
     def dents(self) -> Vector:
         """Return how far the skin at the surface samples of object 0 lies outside of `deformed` [m], shape (N, 3).
 
-        By the law: a contact sinks in by p, of which a bed of springs of at most w = 0.3 min((V / n)^(1/3), 0.6 t)
-        (1 - nu^2) / E takes its part in series with the penalty, along the normal; less where more of the neighbourhood
-        touches, as the solver says, and from where the sample itself touches on. Soft bodies that touch object 0 are
+        By the law: a contact sinks in by p, of which a bed of springs of at most w = 0.35 min((V / n)^(1/3), 0.6 t)
+        (1 - nu^2) / E under the part of the cell that is pressed takes its part in series with the penalty, along the
+        normal; less where more of the neighbourhood touches, as the solver says, and from where the sample itself
+        touches on. Soft bodies that touch object 0 are
         refused.
         """
         body, view, data = self.scene.soft.body, self.scene.solver.view, self.scene.model.softmode
         young, ratio, scale = (float(getattr(data, name).numpy()[0]) for name in MATERIAL)
         size = (body.volume / (body.function_count - body.driven_count)) ** (1.0 / 3.0)
         free = np.abs(body.surface.basis[:, body.driven_count :]).max(axis=1) > 1.0e-6  # the clamped foot has none
-        w = 0.3 * scale * np.minimum(size, 0.6 * thickness(body)) * (1.0 - ratio**2) / young * free
+        w = 0.35 * scale * np.minimum(size, 0.6 * thickness(body)) * (1.0 - ratio**2) / young * free
         c = view.constraints
         assert not c.pair_count.numpy()[0]
         held = slice(int(view.instances.pin_count.numpy()[0]), int(c.count.numpy()[0]))
         sample = c.partner_row.numpy()[0, held] - int(view.instances.row_start.numpy()[0])
         normal, moved = c.normal.numpy()[0, held], c.offset.numpy()[0, held] + c.displacement.numpy()[0, held]
         give = c.dent_compliance.numpy()[0, held]
-        assert (give <= (1.0 + 1.0e-5) * w[sample] / (scale**2 * body.surface.areas[sample])).all()
+        pressed = scale**2 * body.surface.areas[sample] * view.samples.part.numpy()[0, sample].min(axis=1)
+        assert (give * pressed <= (1.0 + 1.0e-5) * w[sample]).all()
         softer = c.stiffness.numpy()[0, held] * give
         penetration = -np.einsum("ek,ek->e", normal, moved)
         depth = softer / (1.0 + softer) * np.maximum(penetration - c.lead.numpy()[0, held], 0.0)
