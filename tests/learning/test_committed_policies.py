@@ -19,7 +19,7 @@ LEAST = {
     "press_soft": (17, 20),
     "push_soft": (15, 20),
     "push_soft_robust": (18, 20),
-    "place_in_bin": (18, 20),
+    "place_in_bin": (16, 20),
     "place_in_bin_gentle": (18, 20),
     "lift_soft_pixels": (8, 10),
 }
