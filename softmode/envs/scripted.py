@@ -161,8 +161,9 @@ class ScriptedPolicy:
             closing: Greatest change while a finger touches nothing.
             holding: Greatest change while both touch.
         """
-        force, most = self.weaker_force, self.finger_forces.max()
-        error = np.clip((wanted - force) / wanted, -1.0, 1.0 if most < 3.0 * wanted else 0.0)
+        forces = self.finger_forces
+        force = forces.min()
+        error = np.clip((wanted - force) / wanted, -1.0, 1.0 if forces.max() < 3.0 * wanted else 0.0)
         return float(np.clip(grip - (closing if force < TOUCH_FORCE else holding) * error, -1.0, 1.0))
 
 

@@ -119,13 +119,13 @@ def shape_of_cell(surface: Surface, instances: Instances, basis: Basis, i: int, 
 
 
 @wp.func
-def slope_of(shape: CellShape, F: wp.mat33d, n: wp.vec3d):
-    """Return m of a cell whose body has the gradient F, n the normal of what it touches, and how little it is steep."""
+def slope_of(shape: CellShape, part: wp.float64, F: wp.mat33d, n: wp.vec3d):
+    """Return m of a part of a cell, and how level that is; F is the gradient, n the normal of what the cell touches."""
     one = wp.float64(1.0)
     pull = wp.transpose(F) * n
     facing = -wp.dot(pull, shape.normal)
     slope = pull + facing * shape.normal
-    share = wp.dot(slope, shape.moments * slope) / (shape.steepest * shape.steepest)
+    share = wp.dot(slope, part * shape.moments * slope) / (shape.steepest * shape.steepest)
     share *= share
     steady = one / (one + share * share)
     if facing <= FACING * wp.length(pull):
@@ -136,13 +136,21 @@ def slope_of(shape: CellShape, F: wp.mat33d, n: wp.vec3d):
 @wp.func
 def fade_of(shape: CellShape, F: wp.mat33d, n: wp.vec3d):
     """Return the range of the gap over which a neighbour counts as touching less and less [m]."""
-    slope, steady = slope_of(shape, F, n)
+    slope, steady = slope_of(shape, wp.float64(1.0), F, n)
     ranges = steady * steady * wp.dot(slope, shape.moments * slope) + shape.bend * shape.bend
     return shape.fade + wp.sqrt(ranges + wp.float64(1.0e-24))  # which has a derivative at zero
 
 
 @wp.func
-def cell_at(shape: CellShape, F: wp.mat33d, n: wp.vec3d, gap: wp.float64, closing: wp.float64, ratio: wp.float64):
+def cell_at(
+    shape: CellShape,
+    part: wp.float64,
+    F: wp.mat33d,
+    n: wp.vec3d,
+    gap: wp.float64,
+    closing: wp.float64,
+    ratio: wp.float64,
+):
     """Return a cell whose sample has a gap [m], ``closing`` [m] more ahead, and a dent of ``ratio`` penalties.
 
     The cell turns with the dent: where there is none and the penalty alone keeps surfaces apart, so stiff a centre of
@@ -150,17 +158,18 @@ def cell_at(shape: CellShape, F: wp.mat33d, n: wp.vec3d, gap: wp.float64, closin
     what it would lean against.
     """
     half = wp.float64(0.5)
-    slope, turn = slope_of(shape, F, n)
+    slope, turn = slope_of(shape, part, F, n)
     dent = ratio * ratio * ratio * ratio
     turn *= dent / (TURNING + dent)
     if gap > NEAR * shape.steepest:
         turn = wp.float64(0.0)
     slope = turn * slope
-    lean = shape.moments * slope
+    lean = part * shape.moments * slope
+    bend = part * shape.bend
     cell = Cell()
-    cell.onset = wp.sqrt(shape.least * shape.least + shape.bend * shape.bend + wp.dot(slope, lean))
+    cell.onset = wp.sqrt(shape.least * shape.least + bend * bend + wp.dot(slope, lean))
     level = shape.least / cell.onset
-    cell.lead = half * (cell.onset - shape.bend) - late_of(shape.poissons_ratio) * level * level * shape.least
+    cell.lead = half * (cell.onset - bend) - late_of(shape.poissons_ratio) * level * level * shape.least
     cell.lead -= wp.dot(slope, shape.middle)
     if turn > LEVEL:
         q = wp.max(cell.lead - gap - closing, wp.float64(0.0))
@@ -169,21 +178,6 @@ def cell_at(shape: CellShape, F: wp.mat33d, n: wp.vec3d, gap: wp.float64, closin
             arm = wp.float64(1.0) / (wp.float64(12.0) * q - wp.float64(6.0) * cell.onset)
         cell.centre = turn * (shape.middle - arm * lean)
     return cell
-
-
-@wp.func
-def part_of_cell(shape: CellShape, part: wp.float64):
-    """Return a cell of which a part is under a face."""
-    cut = CellShape()
-    cut.normal = shape.normal
-    cut.middle = shape.middle
-    cut.moments = part * shape.moments
-    cut.bend = part * shape.bend
-    cut.least = shape.least
-    cut.steepest = shape.steepest
-    cut.fade = shape.fade
-    cut.poissons_ratio = shape.poissons_ratio
-    return cut
 
 
 @wp.func
@@ -212,7 +206,8 @@ def touched_share(
     surface: Surface,
     found: wp.array3d[int],  # (instance_count, sample_max, SLOTS), what is touched
     gap: wp.array3d[wp.float64],  # likewise [m]
-    part: wp.array3d[float],  # likewise, of the cell what lies under it; of one entry: all
+    part: wp.array3d[float],  # likewise, of the cell what lies under it
+    cut: bool,  # whether that counts, as of boxes; else the whole cell
     shape: CellShape,
     fade: wp.float64,
     i: int,
@@ -226,7 +221,7 @@ def touched_share(
         for slot in range(SLOTS):
             if found[i, t, slot] == other:
                 weight = wp.float64(surface.weight[k])
-                if part.shape[1] > 1:
+                if cut:
                     weight *= wp.float64(part[i, t, slot])
                 carried += weight * touching(neighbour_at(shape, fade, gap[i, t, slot]))
     return carried

@@ -104,6 +104,12 @@ def mean_curvature(body: ReducedBody) -> Array:
     return (same * (d * dn).sum(-1)).sum(1) / np.maximum((same * (d * d).sum(-1)).sum(1), 1e-30)
 
 
+def nearest_samples(body: ReducedBody) -> NDArray[np.intp]:
+    """Return the samples around each that bound its cell, itself first, shape (N, K)."""
+    x = body.surface.points
+    return KDTree(x).query(x, min(CELL_NEIGHBOURS + 1, len(x)))[1].reshape(len(x), -1)
+
+
 def cells(body: ReducedBody) -> tuple[Array, Array]:
     """Return the middles of the samples' cells from the samples (N, 3) [m], and 12 second moments about them [m^2].
 
@@ -111,7 +117,7 @@ def cells(body: ReducedBody) -> tuple[Array, Array]:
     those that face another way. It is as large as the area of its sample.
     """
     x, n, area = body.surface.points, body.surface.normals, np.maximum(body.surface.areas, 1e-30)
-    near = KDTree(x).query(x, min(CELL_NEIGHBOURS + 1, len(x)))[1].reshape(len(x), -1)[:, 1:]
+    near = nearest_samples(body)[:, 1:]
     arm, other = x[near] - x[:, None], n[near]
     same = np.einsum("ik,ijk->ij", n, other) > 0.5
     beyond = np.einsum("ijk,ijk->ij", arm, other)
@@ -134,7 +140,7 @@ def cells(body: ReducedBody) -> tuple[Array, Array]:
 def insets(body: ReducedBody) -> Array:
     """Return how far the square that stands for a cell lies from its sample, as it ends at the body's edges [m]."""
     x, n, side = body.surface.points, body.surface.normals, np.sqrt(body.surface.areas)
-    near = KDTree(x).query(x, min(CELL_NEIGHBOURS + 1, len(x)))[1].reshape(len(x), -1)
+    near = nearest_samples(body)
     height = np.einsum("ik,ijk->ij", n, n[near])
     toward = n[near] - height[..., None] * n[:, None]
     steep = np.maximum(np.linalg.norm(toward, axis=2), 1e-30)

@@ -16,7 +16,6 @@ from softmode.deformables.contact.cell_kernels import (
     cell_at,
     fade_of,
     gradient_of,
-    part_of_cell,
     shape_of_cell,
     touched_share,
     write_row,
@@ -310,6 +309,20 @@ def shape_frame(shapes: Shapes, shape: int):
 
 
 @wp.func
+def box_at(instances: Instances, basis: Basis, shapes: Shapes, samples: Samples, i: int, row: int, shape: int):
+    """Return a box and the cell of a sample, and how vectors are turned into the frame of the box."""
+    origin, rotation = shape_frame(shapes, shape)
+    side = instances.scale[i] * wp.sqrt(basis.row_area[row])
+    R = wp.transpose(wp.quat_to_matrix(rotation))
+    box = Box()
+    box.half = wp.vec3d(shapes.scale[shape] + wp.vec3(shapes.margin[shape] + instances.contact_radius[i]))
+    box.x = R * (samples.position[i, row - instances.row_start[i]] - origin)
+    box.normal = wp.vec3d(basis.row_normal[row])
+    box.area = wp.float64(side * side)
+    return box, R
+
+
+@wp.func
 def box_beside(
     instances: Instances,
     basis: Basis,
@@ -327,16 +340,9 @@ def box_beside(
 
     The normal is where it is nearest; ``dent`` as in ``reach_of`` [m].
     """
-    origin, rotation = shape_frame(shapes, shape)
-    side = instances.scale[i] * wp.sqrt(basis.row_area[row])
-    R = wp.transpose(wp.quat_to_matrix(rotation))
-    box = Box()
-    box.half = wp.vec3d(shapes.scale[shape] + wp.vec3(shapes.margin[shape] + instances.contact_radius[i]))
-    box.x = R * (samples.position[i, row - instances.row_start[i]] - origin)
-    box.normal = wp.vec3d(basis.row_normal[row])
+    box, R = box_at(instances, basis, shapes, samples, i, row, shape)
     box.front = R * normal
-    box.area = wp.float64(side * side)
-    box.reach = wp.float64(reach_of(side, dent))
+    box.reach = wp.float64(reach_of(instances.scale[i] * wp.sqrt(basis.row_area[row]), dent))
     box.dent = wp.float64(dent)
     beside = beside_edge(box.half, box.x, gap, box.reach)
     if beside:
@@ -369,16 +375,15 @@ def face_part(
 
     As ``part_under_face``.
     """
-    none = wp.float64(0.0)
-    box, frame, _beside = box_beside(instances, basis, motion, shapes, samples, i, row, shape, wp.vec3d(), none, 0.0)
+    box, R = box_at(instances, basis, shapes, samples, i, row, shape)
     axis = int(-1)
     part = wp.float64(1.0)
     middle = wp.vec3d()
     if near_rim(box):
-        box.F = wp.transpose(frame) * gradient_of(instances, basis, motion.q_start, i, row)
+        box.F = R * gradient_of(instances, basis, motion.q_start, i, row)
         box.inset = wp.vec3d(inset[row])
         axis, part, middle = part_under_face(box)
-    return box, frame, axis, part, middle
+    return box, wp.transpose(R), axis, part, middle
 
 
 @wp.kernel(launch_bounds=(256, 2))
@@ -715,14 +720,15 @@ def gather_contacts(
             start, ahead, closing = motion_of_cell(instances, basis, motion, shapes, samples, i, row, shape, normal, dt)
         if beside:
             fade = fade_of(cell_shape, ahead, normal)
-            touched = touched_share(surface, samples.shape, samples.gap, samples.part, cell_shape, fade, i, row, shape)
+            touched = touched_share(
+                surface, samples.shape, samples.gap, samples.part, True, cell_shape, fade, i, row, shape
+            )
         if part < wp.float64(1.0):
             _box, _frame, _axis, _part, middle = face_part(
                 instances, basis, motion, shapes, samples, surface.inset, i, row, shape
             )
             gap += wp.dot(normal, start * middle)
             closing += wp.dot(normal, (ahead - start) * middle)
-        cell_shape = part_of_cell(cell_shape, part)
         spared = float(wp.float64(1.0) - touched * touched)
         area = wp.max(float(part) * sample_area(instances.scale[i], basis.row_area[row]), 1.0e-30)
         relative = surface.relative_stiffness[row]
@@ -740,7 +746,7 @@ def gather_contacts(
             share = partner_mass / (partner_mass + float(instances.mass[i]))
         compliance = beyond_penalty(stiffness, compliance)
         ratio = stiffness * compliance * wp.float64(share * share)
-        cell = cell_at(cell_shape, ahead, normal, gap, closing, ratio)
+        cell = cell_at(cell_shape, part, ahead, normal, gap, closing, ratio)
         turned = wp.dot(normal, (ahead - start) * cell.centre)
         cell.centre += middle
         ridge = wp.float64(0.0)

@@ -115,7 +115,6 @@ class Pairs:
     normal: wp.array3d[wp.vec3d]  # (..., SLOTS), outward from the other body
     nearest: wp.array3d[int]  # (..., SLOTS), its nearest sample
     share: wp.array3d[float]  # (..., SLOTS), of the sample's own body in the dent of both
-    whole: wp.array3d[float]  # (1, 1, 1), says that soft bodies press whole cells
     tally: wp.array3d[int]  # (instance_count, team, 2), scratch of the list
     held: wp.array3d[int]  # (..., SLOTS), the point constraint it became, -1 for none
     count: wp.array[int]  # (instance_count,)
@@ -596,14 +595,14 @@ def write_pairs(
     F_own = gradient_of(instances, basis, motion.q_start, i, own)
     fade = fade_of(mine, F_own, n)
     theirs = shape_of_cell(surface, instances, basis, j, at, surface.curvature[own] / instances.scale[i])
-    touched_i = touched_share(surface, pairs.other, pairs.gap, pairs.whole, mine, fade, i, own, j)
-    touched_j = touched_share(surface, pairs.other, pairs.gap, pairs.whole, theirs, fade, j, at, i)
+    touched_i = touched_share(surface, pairs.other, pairs.gap, samples.part, False, mine, fade, i, own, j)
+    touched_j = touched_share(surface, pairs.other, pairs.gap, samples.part, False, theirs, fade, j, at, i)
     spared_i = float(wp.float64(1.0) - touched_i)
     spared_j = float(wp.float64(1.0) - touched_j)
     wi = wp.float64(spared_i * dent_compliance(instances, i, ri, surface.dent_length[own]) / half_area)
     wj = wp.float64(spared_j * dent_compliance(instances, j, rj, surface.dent_length[at]) / half_area)
     compliance = beyond_penalty(stiffness, wi + wj)
-    cell = cell_at(mine, F_own, n, pairs.gap[i, s, slot], wp.float64(0.0), stiffness * compliance)
+    cell = cell_at(mine, wp.float64(1.0), F_own, n, pairs.gap[i, s, slot], wp.float64(0.0), stiffness * compliance)
     stick = stick_ratio * shear
     deep = stick
     part = wi / wp.max(wi + wj, wp.float64(1.0e-30))

@@ -29,7 +29,6 @@ from softmode.deformables.model.tables import allocate
 
 _AXES = {
     "": "instance sample slot",
-    "whole": "1 1 1",
     "near count": "instance",
     "surface_normal surface_area": "instance sample",
     "sample constraint mirror": "instance pair",

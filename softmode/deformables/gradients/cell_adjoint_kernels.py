@@ -20,7 +20,6 @@ from softmode.deformables.contact.cell_kernels import (
     fade_of,
     gradient_of,
     neighbour_at,
-    part_of_cell,
     shape_of_cell,
     touched_share,
     touching,
@@ -116,6 +115,7 @@ def part_of(
 @wp.func
 def cell_loss(
     shape: CellShape,
+    part: wp.float64,
     F: wp.mat33d,
     n: wp.vec3d,
     gap: wp.float64,
@@ -126,7 +126,7 @@ def cell_loss(
     centre_bar: wp.vec3d,
 ):
     """Return the loss to first order in what ``cell_at`` returns."""
-    cell = cell_at(shape, F, n, gap, closing, ratio)
+    cell = cell_at(shape, part, F, n, gap, closing, ratio)
     return onset_bar * cell.onset + lead_bar * cell.lead + wp.dot(centre_bar, cell.centre)
 
 
@@ -227,7 +227,6 @@ def accumulate_cells(
     other = curvature_of(shapes, shape, face)
     cell_shape = shape_of_cell(surface, instances, basis, i, row, other)
     part, middle = part_of(instances, basis, motion, shapes, samples, surface, i, row, shape)
-    cut = part_of_cell(cell_shape, part)
     open_gap = gap + wp.dot(face, start * middle)
     closing += wp.dot(face, (ahead - start) * middle)
     back = step.contact_bar[i, e]
@@ -273,24 +272,24 @@ def accumulate_cells(
         by_unit = by_box.unit * box.unit
         by_length = wp.float64(2.0) * by_box.area * box.area + by_box.reach * box.reach + by_box.dent * box.dent
         by_length += by_least * cell_shape.least - by_unit
-    by_shape, by_F, _by_n, _by_gap, by_place, by_ratio, _o, _l, _c = wp.grad(cell_loss)(
-        cut, ahead, face, open_gap, closing, ratio, onset_bar, lead_bar, centre_bar
+    by_shape, by_part, by_F, _by_n, _by_gap, by_place, by_ratio, _o, _l, _c = wp.grad(cell_loss)(
+        cell_shape, part, ahead, face, open_gap, closing, ratio, onset_bar, lead_bar, centre_bar
     )
     fade_shape, fade_F, _fade_n = wp.grad(fade_of)(cell_shape, ahead, face)
-    cell = cell_at(cut, ahead, face, open_gap, closing, ratio)
+    cell = cell_at(cell_shape, part, ahead, face, open_gap, closing, ratio)
     if part < wp.float64(1.0):
         middle_bar += by_place * (wp.transpose(ahead) * face)
         by_F += by_place * wp.outer(face, middle)
         pressed = interpolate(basis.row, constraints.row[i, e], costate, i, instances.function_count[i])
-        part_bar = wp.dot(pressed, constraints.force[i, e])
-        part_bar += by_shape.bend * cut.bend + wp.ddot(by_shape.moments, cut.moments)
-        step.part_bar[i, e] = part_bar
+        step.part_bar[i, e] = wp.dot(pressed, constraints.force[i, e]) + by_part * part
         step.middle_bar[i, e] = middle_bar
     fade = fade_of(cell_shape, ahead, face)
     touched = zero
     spared = zero  # or one, far away: either does not change
     if gap <= NEAR * cell_shape.steepest:
-        touched = touched_share(surface, samples.shape, samples.gap, samples.part, cell_shape, fade, i, row, shape)
+        touched = touched_share(
+            surface, samples.shape, samples.gap, samples.part, True, cell_shape, fade, i, row, shape
+        )
         spared = wp.float64(1.0) - touched * touched
     by_gap = zero
     by_fade = zero
@@ -320,7 +319,7 @@ def accumulate_cells(
 
     # lengths grow with the scale, but not the radius of what is touched
     above = half * spared_bar * by_gap
-    bend_bar = part * by_shape.bend + fade_bar * fade_shape.bend + above
+    bend_bar = by_shape.bend + fade_bar * fade_shape.bend + above
     by_scale = by_length + depth_bar + fade_bar * fade_shape.fade * cell_shape.fade
     by_scale += (by_shape.steepest + fade_bar * fade_shape.steepest) * cell_shape.steepest
     by_scale += (by_shape.least - above) * cell_shape.least
@@ -401,7 +400,7 @@ def restore_rows(
     gap = gap_of(instances, samples, i, row, shape) + wp.dot(n, start * middle)
     closing += wp.dot(n, (ahead - start) * middle)
     ratio = constraints.stiffness[i, e] * constraints.dent_compliance[i, e]
-    cell = cell_at(part_of_cell(cell_shape, part), ahead, n, gap, closing, ratio)
+    cell = cell_at(cell_shape, part, ahead, n, gap, closing, ratio)
     write_row(basis, constraints.row[i, e], row, cell.centre + middle)
 
 
